@@ -1,0 +1,228 @@
+"""The pick-and-place world as a batched TorchRL environment."""
+
+from __future__ import annotations
+
+import secrets
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.envs.simulator import Simulator
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.tasks.goals import MAX_STEPS, check_task, plan
+from ifo_grounding.tasks.grammar import grammar
+from ifo_grounding.tasks.scenes import Scene, SceneOptions, propose_goal
+from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.world import N_BOXES, N_KINDS, Layout, WorldState
+from ifo_grounding.world.tiles import TILE_SIZES
+
+RENDER_TILE_SIZE = 32
+STATE = "state"
+LEAVES = ("arm", "held", "objects", "boxes")
+
+
+class PickAndPlaceEnv(EnvBase):
+    """A batch of 6x6 pick-and-place worlds with instructions.
+
+    An episode ends when the policy stops (terminated) or after ``max_steps`` actions (truncated);
+    the reward is 1 if its instruction is then fulfilled, else 0 (paper, "Environment for Proposed
+    Task").
+
+    Args:
+        task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
+        num_envs: worlds side by side.
+        device: where they live.
+        seed: seed of the stream of scenes; random by default.
+        tile_size: pixels along one side of a cell: 8, 16 or 32.
+        split: ``all``, ``train`` or ``zero-shot`` instructions.
+        instructed: whether scenes come with a suitable instruction. Without, there is no
+            instruction and no reward.
+        expose_state: whether the true state is in the tensordict, for tools other than learners:
+            adds ``("state", ...)`` entries that steps read, and ``reset(td, set_state=True)``.
+        holdout: named list of colour-shape pairs that the split ``train`` does not mention.
+        holdout_visible: whether these pairs are still seen in scenes of the split ``train``.
+        stream: ``training``, ``validation`` or ``evaluation`` scenes.
+        layout: grid size and numbers of things.
+        max_steps: actions per episode.
+
+    Raises:
+        UserError: on an unknown name or an impossible size.
+
+    A reset tensordict may hold ``"scene"``, int64 [*B, 1]: the numbers of the scenes to begin with.
+
+    >>> env = PickAndPlaceEnv("pick-out", num_envs=4, seed=0)
+    >>> rollout = env.rollout(40, break_when_any_done=False)
+    >>> rollout["pixels"].shape, rollout["next", "reward"].shape
+    (torch.Size([4, 40, 3, 48, 48]), torch.Size([4, 40, 1]))
+    """
+
+    def __init__(
+        self,
+        task: str = "move",
+        num_envs: int = 1,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+        tile_size: int = 8,
+        split: str = "all",
+        instructed: bool = True,
+        expose_state: bool = False,
+        *,
+        holdout: str = "pairs-3",
+        holdout_visible: bool = True,
+        stream: str = "training",
+        layout: Layout | None = None,
+        max_steps: int = MAX_STEPS,
+    ) -> None:
+        check_choice("tile size", tile_size, TILE_SIZES)
+        if num_envs < 1:
+            raise UserError(f"num_envs must be at least 1, got {num_envs}")
+        self.options = SceneOptions(
+            task=task,
+            instructed=instructed,
+            split=split,
+            holdout=holdout,
+            holdout_visible=holdout_visible,
+            stream=stream,
+            layout=layout or Layout(),
+            max_steps=max_steps,
+        )
+        super().__init__(device=device or "cpu", batch_size=[num_envs])
+        self.num_envs, self.tile_size = num_envs, tile_size
+        self.expose_state, self.instructed = expose_state, instructed
+        self._supports_set_state = expose_state
+        self.vocabulary_size, self.instruction_length = len(VOCABULARY), VOCABULARY.length
+        seed = secrets.randbits(31) if seed is None else seed
+        self.simulator = Simulator(self.options, num_envs, seed, tile_size, self.device)
+        self._make_specs()
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.options.task
+
+    @property
+    def scene_numbers(self) -> Tensor:
+        """Number of the scene that each row began with, int64 [num_envs]; -1 where it has none."""
+        return self.simulator.numbers
+
+    def _make_specs(self) -> None:
+        batch, device = tuple(self.batch_size), self.device
+        side = self.options.layout.size * self.tile_size
+        observation = Composite(shape=batch, device=device)
+        observation[keys.PIXELS] = Bounded(
+            0, 255, shape=(*batch, 3, side, side), dtype=torch.uint8, device=device
+        )
+        if self.instructed:
+            observation[keys.INSTRUCTION] = Bounded(
+                0,
+                self.vocabulary_size - 1,
+                shape=(*batch, self.instruction_length),
+                dtype=torch.int64,
+                device=device,
+            )
+        if self.expose_state:
+            observation[STATE] = self._world_spec()
+            self.state_spec = Composite({STATE: self._world_spec()}, shape=batch, device=device)
+        self.observation_spec = observation
+        self.action_spec = Categorical(keys.N_ACTIONS, shape=batch, device=device)
+        self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
+        flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            {name: flag.clone() for name in ("done", "terminated", "truncated")},
+            shape=batch,
+            device=device,
+        )
+
+    def _world_spec(self) -> Composite:
+        batch, cells = tuple(self.batch_size), self.options.layout.size**2
+
+        def bounded(high: int, dtype: torch.dtype, *shape: int) -> Bounded:
+            return Bounded(0, high, shape=(*batch, *shape), dtype=dtype, device=self.device)
+
+        return Composite(
+            arm=bounded(cells - 1, torch.int64),
+            held=bounded(N_KINDS, torch.uint8),
+            objects=bounded(N_KINDS, torch.uint8, cells),
+            boxes=bounded(N_BOXES, torch.uint8, cells),
+            shape=batch,
+            device=self.device,
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None or self.simulator.scene is None:
+            rows = torch.arange(self.num_envs, device=self.device)
+        else:
+            rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
+        if kwargs.get("set_state") and tensordict is not None and STATE in tensordict.keys():
+            self.simulator.place(rows, self._given_scene(tensordict)[rows])
+        else:
+            numbers = None if tensordict is None else tensordict.get(keys.SCENE, None)
+            if numbers is not None:
+                numbers = numbers.reshape(self.num_envs)[rows]
+            self.simulator.reset(rows, numbers)
+        result = self._observe(None if len(rows) == self.num_envs else rows)
+        for name in ("done", "terminated", "truncated"):
+            result[name] = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        return result
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
+            assert self.simulator.scene is not None, "reset before stepping"
+            self.simulator.scene.state = self._world(given)
+        success, terminated, truncated = self.simulator.step(tensordict.get(keys.ACTION))
+        result = self._observe()
+        result[keys.REWARD] = success.float().unsqueeze(-1)
+        result["done"] = (terminated | truncated).unsqueeze(-1)
+        result["terminated"] = terminated.unsqueeze(-1)
+        result["truncated"] = truncated.unsqueeze(-1)
+        return result
+
+    def _observe(self, rows: Tensor | None = None) -> TensorDict:
+        """Observe all rows; where ``rows`` is given, the others may hold anything."""
+        result = TensorDict({}, batch_size=self.batch_size, device=self.device)
+        drawn = self.simulator.pixels(rows)
+        if rows is not None:
+            pixels = drawn.new_zeros(self.num_envs, *drawn.shape[1:])
+            pixels[rows] = drawn
+            drawn = pixels
+        result[keys.PIXELS] = drawn
+        if self.instructed:
+            result[keys.INSTRUCTION] = self.simulator.instruction.clone()
+        if self.expose_state:
+            assert self.simulator.scene is not None
+            state = self.simulator.scene.state
+            leaves = {leaf: getattr(state, leaf).clone() for leaf in LEAVES}
+            result[STATE] = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        return result
+
+    def _world(self, given: TensorDictBase) -> WorldState:
+        return WorldState(**{leaf: given[leaf] for leaf in LEAVES}, batch_size=self.batch_size)
+
+    def _given_scene(self, tensordict: TensorDictBase) -> Scene:
+        """Make scenes of given states, and of the instructions beside them."""
+        state = self._world(tensordict[STATE])
+        tokens = tensordict.get(keys.INSTRUCTION, None)
+        if not self.instructed:
+            shape = (self.num_envs, self.instruction_length)
+            tokens = torch.zeros(shape, dtype=torch.int64, device=self.device)
+            goal = propose_goal(state.cpu(), check_task(self.task), torch.Generator())
+        elif tokens is None:
+            raise UserError("reset(set_state=True) needs an instruction beside the state")
+        else:
+            goal = grammar(self.task).parse_tokens(tokens)
+        wanted = plan(state, goal.to(self.device), self.options.max_steps)
+        return Scene(state=state, wanted=wanted, instruction=tokens, batch_size=self.batch_size)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.simulator.seed(secrets.randbits(31) if seed is None else seed)
+
+    def render(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
+        """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
+        return self.simulator.pixels(tile_size=tile_size).permute(0, 2, 3, 1).cpu().numpy()

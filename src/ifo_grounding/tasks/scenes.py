@@ -1,0 +1,176 @@
+"""Numbered scenes: every number is one fixed initial state, with a suitable goal where asked for.
+
+A stream of scenes is a function of its seed and name, so that a scene can be drawn again by its
+number, training and evaluation never meet, and results can name the scenes that they are about.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase, tensorclass
+from torch import Tensor
+
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.seeding import STREAMS, generator
+from ifo_grounding.tasks.goals import (
+    MAX_STEPS,
+    MOVE_UDLR,
+    PICK,
+    PICK_OUT,
+    PICK_UDLR,
+    SUITABLE,
+    Goal,
+    Plan,
+    check_task,
+    plan,
+)
+from ifo_grounding.tasks.grammar import SPLITS, grammar, holdout_kinds, in_split
+from ifo_grounding.world import Layout, WorldState, random_layout
+
+CHUNK = 1024
+"""Scenes that are drawn at once."""
+CHUNKS_KEPT = 512
+PATIENCE = 1000
+"""Draws of a chunk after which a layout counts as unable to hold a suitable goal."""
+
+
+@tensorclass
+class Scene:
+    """Initial states with what is asked there."""
+
+    state: WorldState
+    """Initial state, [*B]."""
+    wanted: Plan
+    """The goal resolved in it, [*B]."""
+    instruction: Tensor
+    """Tokens of a sentence for the goal, int64 [*B, 16]."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """Which scenes a stream holds."""
+
+    task: str = "move"
+    """One of the five tasks."""
+    instructed: bool = True
+    """Whether each scene has a suitable goal; else goals are absent and scenes unconditioned."""
+    split: str = "all"
+    """``all``, ``train`` or ``zero-shot``."""
+    holdout: str = "pairs-3"
+    """Named list of colour-shape pairs that training instructions do not mention."""
+    holdout_visible: bool = True
+    """Whether held-out pairs are still seen in the scenes of the split ``train``."""
+    stream: str = "training"
+    """``training``, ``validation`` or ``evaluation``: disjoint scenes."""
+    layout: Layout = field(default_factory=Layout)
+    """Grid size and counts."""
+    max_steps: int = MAX_STEPS
+    """Actions per episode; a goal that needs more is unachievable."""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown names."""
+        check_task(self.task)
+        check_choice("split", self.split, SPLITS)
+        check_choice("stream", self.stream, STREAMS)
+        holdout_kinds(self.holdout)
+        if self.max_steps < 1:
+            raise UserError(f"max_steps must be positive, got {self.max_steps}")
+
+    @property
+    def shown_layout(self) -> Layout:
+        """The layout, without held-out kinds where they must not be seen."""
+        if self.holdout_visible or self.split != "train":
+            return self.layout
+        excluded = (*self.layout.excluded_kinds, *holdout_kinds(self.holdout))
+        return Layout(**{**self.layout.__dict__, "excluded_kinds": excluded})
+
+
+class SceneStream:
+    """The scenes of one seed, by number.
+
+    >>> stream = SceneStream(SceneOptions("pick"), seed=0)
+    >>> scenes = stream.scenes(torch.tensor([5, 2000]))
+    >>> scenes.instruction.shape, scenes.wanted.verdict.tolist()
+    (torch.Size([2, 16]), [0, 0])
+    """
+
+    def __init__(self, options: SceneOptions, seed: int, device: object = None) -> None:
+        self.options, self.seed = options, seed
+        self.device = torch.device(device or "cpu")  # type: ignore[arg-type]
+        self._chunk = functools.lru_cache(maxsize=CHUNKS_KEPT)(self._draw_chunk)
+
+    def scenes(self, numbers: Tensor) -> Scene:
+        """Return the scenes with the given numbers, int64 [N]."""
+        if numbers.numel() and int(numbers.min()) < 0:
+            raise UserError("scene numbers start at 0")
+        chunks = (numbers // CHUNK).tolist()
+        distinct = sorted(set(chunks))
+        if len(distinct) == 1:
+            return self._chunk(distinct[0])[numbers % CHUNK]
+        first_row = {chunk: CHUNK * place for place, chunk in enumerate(distinct)}
+        start = torch.tensor([first_row[chunk] for chunk in chunks], device=numbers.device)
+        return torch.cat([self._chunk(chunk) for chunk in distinct])[start + numbers % CHUNK]
+
+    def _draw_chunk(self, chunk: int) -> Scene:
+        """Draw scenes on the CPU, so that every device gets the same ones."""
+        options = self.options
+        draw = generator(self.seed, "scenes", options.stream, chunk)
+        kept: list[TensorDictBase] = []
+        missing = CHUNK
+        for _ in range(PATIENCE):
+            scenes = self._propose(draw)
+            if options.instructed:
+                scenes = scenes[scenes.wanted.verdict == SUITABLE]
+            kept.append(scenes[:missing])
+            missing -= len(kept[-1])
+            if not missing:
+                return torch.cat(kept).to(self.device)
+        raise UserError(
+            f"after {PATIENCE * CHUNK} draws only {CHUNK - missing} scenes admit a suitable goal of "
+            f"{options.task!r} in split {options.split!r}: give the layout more objects or boxes"
+        )
+
+    def _propose(self, draw: torch.Generator) -> Scene:
+        options = self.options
+        state = random_layout(CHUNK, options.shown_layout, generator=draw)
+        goal = propose_goal(state, check_task(options.task), draw)
+        wanted = plan(state, goal, options.max_steps)
+        listed = in_split(goal, options.split, options.holdout)
+        wanted.verdict = torch.where(listed, wanted.verdict, -1)
+        sentences = grammar(options.task)
+        said = torch.zeros(CHUNK, sentences.tokens.shape[-1], dtype=torch.int64)
+        wordings = torch.randint(len(sentences.phrasings), (CHUNK,), generator=draw)
+        accepted = wanted.verdict == SUITABLE
+        said[accepted] = sentences.encode(goal[accepted], wordings[accepted])
+        return Scene(state=state, wanted=wanted, instruction=said, batch_size=[CHUNK])
+
+
+def propose_goal(state: WorldState, task: int, draw: torch.Generator) -> Goal:
+    """Draw a goal about things that are in a state; it need not be suitable."""
+    shape = state.arm.shape
+
+    def pick(mask: Tensor) -> Tensor:
+        """Draw one true cell of each row."""
+        return (torch.rand(mask.shape, generator=draw) * mask).argmax(-1, keepdim=True)
+
+    def at(cells: Tensor, values: Tensor) -> Tensor:
+        return values.gather(-1, cells).squeeze(-1).long()
+
+    nothing = torch.zeros(shape, dtype=torch.int64)
+    exists = state.objects > 0
+    candidates = exists & (state.boxes > 0) if task == PICK_OUT else exists
+    cell = pick(candidates)
+    other = pick(exists.scatter(-1, cell, torch.zeros_like(cell, dtype=torch.bool)))
+    has_box = state.boxes > 0
+    return Goal(
+        task=torch.full(shape, task),
+        object=at(cell, state.objects),
+        reference=at(other, state.objects) if task == PICK_UDLR else nothing,
+        source=at(cell, state.boxes) if task == PICK_OUT else nothing,
+        target=at(pick(has_box), state.boxes) if task in (PICK, PICK_OUT) else nothing,
+        side=torch.randint(4, shape, generator=draw) if task in (MOVE_UDLR, PICK_UDLR) else nothing,
+        batch_size=shape,
+    )

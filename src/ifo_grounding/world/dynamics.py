@@ -1,0 +1,58 @@
+"""What actions do: ``step(state, action) -> state``."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ifo_grounding.world.state import WorldState
+
+UP, RIGHT, DOWN, LEFT, PICK_PLACE, STOP = range(6)
+N_ACTIONS = 6
+
+
+def neighbour(cell: Tensor, direction: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Return the cell next to ``cell`` and whether it lies on the grid.
+
+    Args:
+        cell: cells, int64 [*B].
+        direction: 0..3 for up, right, down, left, int64 [*B].
+        size: cells along one side.
+
+    Returns:
+        The neighbour (the cell itself where off the grid), int64 [*B], and a bool [*B].
+    """
+    row, column = cell // size, cell % size
+    row = row + (direction == DOWN).long() - (direction == UP).long()
+    column = column + (direction == RIGHT).long() - (direction == LEFT).long()
+    inside = (row >= 0) & (row < size) & (column >= 0) & (column < size)
+    return torch.where(inside, row * size + column, cell), inside
+
+
+def step(state: WorldState, action: Tensor) -> WorldState:
+    """Apply one action to each world.
+
+    Moves off the grid and picks or places with nothing to do leave a world unchanged, and so does
+    stop. A cell holds one object at most: placing on an occupied cell does nothing.
+
+    Args:
+        state: worlds [*B].
+        action: 0..5 for up, right, down, left, pick or place, stop; int64 [*B].
+
+    Returns:
+        New worlds [*B]; the given ones stay as they were.
+
+    >>> state = WorldState.empty(1, size=6)
+    >>> step(state, torch.tensor([DOWN])).arm
+    tensor([6])
+    """
+    arm, held, objects = state.arm, state.held, state.objects
+    arm = neighbour(arm, action, state.size)[0]
+    here = arm.unsqueeze(-1)
+    under = objects.gather(-1, here).squeeze(-1)
+    reaches = (action == PICK_PLACE) & ((held == 0) != (under == 0))
+    objects = objects.scatter(-1, here, torch.where(reaches, held, under).unsqueeze(-1))
+    held = torch.where(reaches, under, held)
+    return WorldState(
+        arm=arm, held=held, objects=objects, boxes=state.boxes, batch_size=state.batch_size
+    )

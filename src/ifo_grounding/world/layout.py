@@ -1,0 +1,103 @@
+"""Random initial states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.world.state import N_BOXES, N_KINDS, WorldState
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How many things a scene holds, and where."""
+
+    size: int = 6
+    """Cells along one side of the grid, 3..16."""
+    objects: tuple[int, int] = (4, 8)
+    """Fewest and most objects."""
+    boxes: tuple[int, int] = (2, 4)
+    """Fewest and most boxes; their colours differ."""
+    inside: float = 0.35
+    """Probability that an object starts inside a box, as long as boxes are free."""
+    excluded_kinds: tuple[int, ...] = ()
+    """Object kinds that no scene shows."""
+
+    def __post_init__(self) -> None:
+        """Refuse layouts that no grid can hold."""
+        if not 3 <= self.size <= 16:
+            raise UserError(f"size must be 3..16 cells, got {self.size}")
+        for name, (low, high), most in (
+            ("objects", self.objects, self.size**2),
+            ("boxes", self.boxes, N_BOXES),
+        ):
+            if not 0 <= low <= high <= most:
+                raise UserError(f"{name} must be (fewest, most) within 0..{most}, got {low, high}")
+        if self.objects[1] + self.boxes[1] > self.size**2:
+            raise UserError(
+                f"{self.objects[1]} objects and {self.boxes[1]} boxes do not fit on "
+                f"{self.size}x{self.size} cells: ask for fewer or a larger grid"
+            )
+        if not 0.0 <= self.inside <= 1.0:
+            raise UserError(f"inside must be a probability, got {self.inside}")
+        if not set(range(1, N_KINDS + 1)) - set(self.excluded_kinds):
+            raise UserError("excluded_kinds leaves no kind of object")
+
+
+def random_layout(
+    batch: int,
+    layout: Layout | None = None,
+    *,
+    generator: torch.Generator | None = None,
+    device: torch.device | str | None = None,
+) -> WorldState:
+    """Draw initial states: objects and boxes in distinct places, the arm anywhere, nothing held.
+
+    An object is put inside a box with probability ``layout.inside``, at most one in each box.
+
+    >>> state = random_layout(3, generator=torch.Generator().manual_seed(0))
+    >>> state.held.tolist()
+    [0, 0, 0]
+    """
+    layout = layout or Layout()
+    cells = layout.size**2
+    most_objects, most_boxes = layout.objects[1], layout.boxes[1]
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(batch, *shape, generator=generator, device=device)
+
+    def count(low: int, high: int) -> Tensor:
+        return low + (rand(1) * (high - low + 1)).long()
+
+    places = rand(cells).topk(most_boxes + most_objects).indices
+    box_cells, free_cells = places.split([most_boxes, most_objects], dim=-1)
+
+    colours = 1 + rand(N_BOXES).argsort(-1)[:, :most_boxes]
+    n_boxes = count(*layout.boxes)
+    box_exists = torch.arange(most_boxes, device=device) < n_boxes
+    boxes = torch.zeros(batch, cells, dtype=torch.uint8, device=device)
+    boxes.scatter_(-1, box_cells, (colours * box_exists).to(torch.uint8))
+
+    allowed = [k for k in range(1, N_KINDS + 1) if k not in layout.excluded_kinds]
+    table = torch.tensor(allowed, device=device)
+    kinds = table[(rand(most_objects) * len(allowed)).long()]
+    kinds = kinds * (torch.arange(most_objects, device=device) < count(*layout.objects))
+
+    wants_box = (rand(most_objects) < layout.inside) & (kinds > 0)
+    rank = wants_box.long().cumsum(-1) - 1
+    in_box = wants_box & (rank < n_boxes)
+    if most_boxes:
+        boxed_cell = box_cells.gather(-1, rank.clamp(0, most_boxes - 1))
+        cell = torch.where(in_box, boxed_cell, free_cells)
+    else:
+        cell = free_cells
+    # Cells are distinct, so that adding writes each kind once and nothing where there is none.
+    objects = torch.zeros(batch, cells, dtype=torch.uint8, device=device)
+    objects.scatter_add_(-1, cell, kinds.to(torch.uint8))
+
+    arm = (rand(1).squeeze(-1) * cells).long()
+    held = torch.zeros(batch, dtype=torch.uint8, device=device)
+    return WorldState(arm=arm, held=held, objects=objects, boxes=boxes, batch_size=[batch])
