@@ -160,7 +160,9 @@ class PickAndPlaceEnv(EnvBase):
             rows = torch.arange(self.num_envs, device=self.device)
         else:
             rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
-        if kwargs.get("set_state") and tensordict is not None and STATE in tensordict.keys():
+        if kwargs.get("set_state"):
+            if tensordict is None or STATE not in tensordict:
+                raise UserError("reset(set_state=True) needs a tensordict with a state")
             self.simulator.place(rows, self._given_scene(tensordict)[rows])
         else:
             numbers = None if tensordict is None else tensordict.get(keys.SCENE, None)
@@ -175,7 +177,8 @@ class PickAndPlaceEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
             assert self.simulator.scene is not None, "reset before stepping"
-            self.simulator.scene.state = self._world(given)
+            # A copy: later resets write into the simulator's state, not into the caller's.
+            self.simulator.scene.state = self._world(given).clone()
         success, terminated, truncated = self.simulator.step(tensordict.get(keys.ACTION))
         result = self._observe()
         result[keys.REWARD] = success.float().unsqueeze(-1)

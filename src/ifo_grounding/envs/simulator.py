@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
 from ifo_grounding.tasks.goals import fulfilled
 from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
@@ -66,13 +67,21 @@ class Simulator:
         self.numbers[rows] = -1
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Apply one action to each row.
+        """Apply one action, int64 [num_envs], to each row.
 
         Returns:
             Success, terminated and truncated, bool [num_envs] each. Success is judged when an
             episode ends, and always false where there are no instructions.
+
+        Raises:
+            UserError: where actions have another shape, such as one-hot actions.
         """
         assert self.scene is not None, "reset before stepping"
+        if action.shape != self.steps.shape:
+            raise UserError(
+                f"actions must be one integer for each of {self.num_envs} worlds, "
+                f"got shape {list(action.shape)}"
+            )
         self.scene.state = step(self.scene.state, action)
         self.steps = self.steps + 1
         terminated = action == STOP

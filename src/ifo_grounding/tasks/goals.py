@@ -6,7 +6,7 @@ This is the oracle: evaluation uses it, learners never do.
 from __future__ import annotations
 
 import torch
-from tensordict import tensorclass
+from tensordict import TensorClass
 from torch import Tensor
 
 from ifo_grounding.errors import check_choice
@@ -36,8 +36,7 @@ def check_task(task: str) -> int:
     return TASKS.index(task)
 
 
-@tensorclass
-class Goal:
+class Goal(TensorClass):
     """A batch of goals; what a task does not mention is 0."""
 
     task: Tensor
@@ -64,8 +63,7 @@ class Goal:
         return self.task >= PICK
 
 
-@tensorclass
-class Plan:
+class Plan(TensorClass):
     """A goal with its referents resolved in the initial state."""
 
     verdict: Tensor

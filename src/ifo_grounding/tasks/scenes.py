@@ -10,7 +10,7 @@ import functools
 from dataclasses import dataclass, field
 
 import torch
-from tensordict import TensorDictBase, tensorclass
+from tensordict import TensorClass
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, check_choice
@@ -37,8 +37,7 @@ PATIENCE = 1000
 """Draws of a chunk after which a layout counts as unable to hold a suitable goal."""
 
 
-@tensorclass
-class Scene:
+class Scene(TensorClass):
     """Initial states with what is asked there."""
 
     state: WorldState
@@ -97,9 +96,11 @@ class SceneStream:
     (torch.Size([2, 16]), [0, 0])
     """
 
-    def __init__(self, options: SceneOptions, seed: int, device: object = None) -> None:
+    def __init__(
+        self, options: SceneOptions, seed: int, device: torch.device | str | None = None
+    ) -> None:
         self.options, self.seed = options, seed
-        self.device = torch.device(device or "cpu")  # type: ignore[arg-type]
+        self.device = torch.device(device or "cpu")
         self._chunk = functools.lru_cache(maxsize=CHUNKS_KEPT)(self._draw_chunk)
 
     def scenes(self, numbers: Tensor) -> Scene:
@@ -107,18 +108,18 @@ class SceneStream:
         if numbers.numel() and int(numbers.min()) < 0:
             raise UserError("scene numbers start at 0")
         chunks = (numbers // CHUNK).tolist()
-        distinct = sorted(set(chunks))
+        distinct = sorted(set(chunks)) or [0]
         if len(distinct) == 1:
             return self._chunk(distinct[0])[numbers % CHUNK]
         first_row = {chunk: CHUNK * place for place, chunk in enumerate(distinct)}
         start = torch.tensor([first_row[chunk] for chunk in chunks], device=numbers.device)
-        return torch.cat([self._chunk(chunk) for chunk in distinct])[start + numbers % CHUNK]
+        return _cat([self._chunk(chunk) for chunk in distinct])[start + numbers % CHUNK]
 
     def _draw_chunk(self, chunk: int) -> Scene:
         """Draw scenes on the CPU, so that every device gets the same ones."""
         options = self.options
         draw = generator(self.seed, "scenes", options.stream, chunk)
-        kept: list[TensorDictBase] = []
+        kept: list[Scene] = []
         missing = CHUNK
         for _ in range(PATIENCE):
             scenes = self._propose(draw)
@@ -127,10 +128,10 @@ class SceneStream:
             kept.append(scenes[:missing])
             missing -= len(kept[-1])
             if not missing:
-                return torch.cat(kept).to(self.device)
+                return _cat(kept).to(self.device)
         raise UserError(
-            f"after {PATIENCE * CHUNK} draws only {CHUNK - missing} scenes admit a suitable goal of "
-            f"{options.task!r} in split {options.split!r}: give the layout more objects or boxes"
+            f"after {PATIENCE * CHUNK} draws only {CHUNK - missing} scenes admit a suitable goal "
+            f"of {options.task!r} in split {options.split!r}: give the layout more objects or boxes"
         )
 
     def _propose(self, draw: torch.Generator) -> Scene:
@@ -148,6 +149,10 @@ class SceneStream:
         return Scene(state=state, wanted=wanted, instruction=said, batch_size=[CHUNK])
 
 
+def _cat(scenes: list[Scene]) -> Scene:
+    return torch.cat(scenes)  # type: ignore[arg-type, return-value]
+
+
 def propose_goal(state: WorldState, task: int, draw: torch.Generator) -> Goal:
     """Draw a goal about things that are in a state; it need not be suitable."""
     shape = state.arm.shape
@@ -163,12 +168,13 @@ def propose_goal(state: WorldState, task: int, draw: torch.Generator) -> Goal:
     exists = state.objects > 0
     candidates = exists & (state.boxes > 0) if task == PICK_OUT else exists
     cell = pick(candidates)
-    other = pick(exists.scatter(-1, cell, torch.zeros_like(cell, dtype=torch.bool)))
+    others = state.objects.scatter(-1, cell, 0)
+    other = pick(others > 0)
     has_box = state.boxes > 0
     return Goal(
         task=torch.full(shape, task),
         object=at(cell, state.objects),
-        reference=at(other, state.objects) if task == PICK_UDLR else nothing,
+        reference=at(other, others) if task == PICK_UDLR else nothing,
         source=at(cell, state.boxes) if task == PICK_OUT else nothing,
         target=at(pick(has_box), state.boxes) if task in (PICK, PICK_OUT) else nothing,
         side=torch.randint(4, shape, generator=draw) if task in (MOVE_UDLR, PICK_UDLR) else nothing,

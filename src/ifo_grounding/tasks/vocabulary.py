@@ -92,7 +92,7 @@ class Vocabulary:
 WORDS = (
     *("circle", "rectangle", "diamond", "triangle", "red", "yellow", "blue"),
     *("orange", "green", "purple", "pink", "brown", "gray", "cyan"),
-    *("the", "box", "object", "cell", "above", "below", "left", "right", "of", "to", "from"),
+    *("the", "box", "cell", "above", "below", "left", "right", "of", "to", "from"),
     *("in", "into", "inside", "out", "and", "it", "up", "arm"),
     *("move", "go", "put", "place", "drop", "pick", "take", "bring", "carry", "transfer"),
     *("shift", "get", "remove", "pull", "lift"),

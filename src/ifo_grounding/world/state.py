@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 
 import torch
-from tensordict import tensorclass
+from tensordict import TensorClass
 from torch import Tensor
+
+from ifo_grounding.errors import check_choice
 
 SHAPES = ("circle", "rectangle", "diamond", "triangle")
 COLOURS = ("red", "yellow", "blue")
@@ -21,6 +23,8 @@ def kind(colour: str, shape: str) -> int:
     >>> kind("red", "circle"), kind("blue", "triangle")
     (1, 12)
     """
+    check_choice("colour", colour, COLOURS)
+    check_choice("shape", shape, SHAPES)
     return 1 + COLOURS.index(colour) * len(SHAPES) + SHAPES.index(shape)
 
 
@@ -34,8 +38,7 @@ def kind_name(number: int) -> str:
     return f"{COLOURS[colour]} {SHAPES[shape]}"
 
 
-@tensorclass
-class WorldState:
+class WorldState(TensorClass):
     """A batch of worlds: an arm, what it holds, objects and boxes on a square grid.
 
     Cells are numbered row by row from the top left. Objects of one kind (colour and shape) are
@@ -62,7 +65,9 @@ class WorldState:
         return math.isqrt(self.objects.shape[-1])
 
     @classmethod
-    def empty(cls, batch: int, size: int = 6, device: object = None) -> WorldState:
+    def empty(
+        cls, batch: int, size: int = 6, device: torch.device | str | None = None
+    ) -> WorldState:
         """Return worlds without objects or boxes, the arm in the top left cell."""
         cells = size * size
         return cls(

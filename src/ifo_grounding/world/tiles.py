@@ -37,13 +37,13 @@ PALETTE = {
     "cyan": (84, 204, 214),
 }
 
-SPRITES = {
+SPRITES: dict[str, tuple[str, ...]] = {
     "circle": (".####.", "######", "######", "######", "######", ".####."),
     "rectangle": ("......", "######", "######", "######", "######", "......"),
     "diamond": ("..##..", ".####.", "######", "######", ".####.", "..##.."),
     "triangle": ("......", "..##..", "..##..", ".####.", ".####.", "######"),
 }
-SMALL_SPRITES = {
+SMALL_SPRITES: dict[str, tuple[str, ...]] = {
     "circle": ("###", "#.#", "###"),
     "rectangle": ("...", "###", "###"),
     "diamond": (".#.", "###", ".#."),
@@ -56,7 +56,7 @@ def tile_index(state: WorldState) -> Tensor:
     """Return which tile each cell shows, int64 [*B, size, size].
 
     >>> tile_index(WorldState.empty(1, size=3)).flatten().tolist()
-    [26, 0, 0, 0, 0, 0, 0, 0, 0]
+    [104, 0, 0, 0, 0, 0, 0, 0, 0]
     """
     size = state.size
     index = state.boxes.long() + (N_BOXES + 1) * state.objects.long()
@@ -143,12 +143,12 @@ def _draw_large(size: int) -> np.ndarray:
     tiles[:] = GRID
     ground = np.array([FLOOR, *(PALETTE[colour] for colour in BOX_COLOURS)], np.float32)
     _paint(tiles, _square(size, 0.5, 0.5 - 0.5 / size), ground[box])
-    _paint(tiles, _square(size, 0.3, 0.24) * holding[:, None, None], np.float32(WHITE))
+    _paint(tiles, _square(size, 0.3, 0.24) * holding[:, None, None], _rgb(WHITE))
     _paint_objects(tiles, held, 0.31, 0.19)
     _paint_objects(tiles, np.where(holding, under, 0), 0.69, 0.17)
     _paint_objects(tiles, np.where(holding, 0, under), 0.5, 0.34)
     border = 1 - _square(size, 0.5, 0.5 - 0.085)
-    _paint(tiles, border * (arm > 0)[:, None, None], np.float32(WHITE))
+    _paint(tiles, border * (arm > 0)[:, None, None], _rgb(WHITE))
     return tiles.round().astype(np.uint8)
 
 
@@ -158,14 +158,18 @@ def _paint(tiles: np.ndarray, alpha: np.ndarray, colour: np.ndarray) -> None:
     tiles += alpha * (colour.reshape(-1, 1, 1, 3) - tiles)
 
 
+def _rgb(colour: tuple[int, int, int]) -> np.ndarray:
+    return np.array(colour, np.float32)
+
+
 def _paint_objects(tiles: np.ndarray, kinds: np.ndarray, centre: float, radius: float) -> None:
     size = tiles.shape[1]
     for kind in range(1, N_KINDS + 1):
         rows = np.flatnonzero(kinds == kind)
         shape, colour = _look(kind)
         painted = tiles[rows]
-        _paint(painted, _cover(size, shape, centre, radius), np.float32(OUTLINE))
-        _paint(painted, _cover(size, shape, centre, radius * 0.84), np.float32(colour))
+        _paint(painted, _cover(size, shape, centre, radius), _rgb(OUTLINE))
+        _paint(painted, _cover(size, shape, centre, radius * 0.84), _rgb(colour))
         tiles[rows] = painted
 
 

@@ -1,0 +1,52 @@
+# Two commands set everything up: `make demo` runs the main job, `make test` runs the tests.
+PYTHON ?= $(shell python3.11 -c 'import venv' 2>/dev/null && echo python3.11 || echo python3)
+WORKERS ?= 2
+BIN := .venv/bin
+RUN := .venv/.installed
+DEV := .venv/.installed-dev
+
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.PHONY: help demo test test-slow lint types docs format wheel clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+demo: $(RUN) ## main job: both phases on one task and a report (TASK=pick, ARGS="seed=1")
+	$(BIN)/ifo-grounding demo $(if $(TASK),task=$(TASK)) $(ARGS)
+
+test: $(DEV) ## all fast tests, doctests and examples of the docs; line coverage >= 90%
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --cov $(ARGS)
+
+test-slow: $(DEV) ## tests that train for minutes
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) -m slow --timeout 3600 $(ARGS)
+
+lint: $(DEV) ## style
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(DEV) ## type check
+	$(BIN)/mypy
+
+docs: $(DEV) ## build the documentation into site/, warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+format: $(DEV) ## format and fix what can be fixed
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+wheel: $(DEV) ## build dist/*.whl
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+
+clean: ## remove the environment and all that was built
+	rm -rf .venv build dist site htmlcov .coverage .coverage.* .pytest_cache .mypy_cache .ruff_cache
+
+$(RUN): pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(DEV): pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --editable ".[dev,docs]"
+	@touch $(RUN) $@

@@ -1,0 +1,142 @@
+"""What every recipe needs: the run, the world, and configs from the options."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torch import nn
+from torchrl import torchrl_logger
+from torchrl.data import ReplayBuffer
+
+from ifo_grounding import networks
+from ifo_grounding.data import Demonstrations, LabelReport
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
+from ifo_grounding.training.run import Run, Stage
+from ifo_grounding.world import Layout
+
+torchrl_logger.setLevel("WARNING")
+
+RANDOM_STEPS = "transitions"
+DEMONSTRATIONS = "demonstrations"
+TRUTH = "truth"
+LABELS = "labels"
+INVERSE = "inverse.safetensors"
+POLICIES = ("policy-phase1.safetensors", "policy-phase2.safetensors")
+CLASSIFIER = "instruction.safetensors"
+REWARD = "reward.safetensors"
+GOAL = "goal.safetensors"
+
+
+def open_run(options: DictConfig) -> Run:
+    """Return the run of these options, with torch's threads set."""
+    torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    return Run(options.run, options.logger)
+
+
+def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:
+    """Return a stage that is decided by some sections of the options, the seed and the world."""
+    common = ["task", "seed", "network", "world"]
+    decisive = {key: plain(options[key]) for key in [*common, *sections]}
+    stage = open_run(options).stage(name, decisive, needs)
+    print(f"{name}: {'done before' if stage.result is not None else 'running'}", flush=True)
+    return stage
+
+
+def shows_progress(options: DictConfig) -> bool:
+    """Whether to show progress bars: if asked to, and if somebody can see them move."""
+    return options.progress and sys.stderr.isatty()
+
+
+def world(options: DictConfig) -> dict[str, Any]:
+    """Return the arguments of the world that environments and the recorder share."""
+    chosen = plain(options.world)
+    layout: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in chosen.pop("layout").items()
+    }
+    return {**chosen, "layout": Layout(**layout)}
+
+
+def simulator(options: DictConfig, num_envs: int = 1, **kwargs: Any) -> PickAndPlaceEnv:
+    """Return the simulator without instructions and rewards: all that a learner may step."""
+    return PickAndPlaceEnv(
+        options.task,
+        num_envs=num_envs,
+        seed=options.seed,
+        device=options.device,
+        instructed=False,
+        **{**world(options), **kwargs},
+    )
+
+
+def build(make: Callable[..., Any], options: DictConfig, **kwargs: Any) -> Any:
+    """Build a network for the simulator's images, words and actions."""
+    return make(
+        simulator(options), options.network, seed=options.seed, device=options.device, **kwargs
+    )
+
+
+def load_network(run: Run, name: str, recipe: str, options: DictConfig) -> Any:
+    """Load a network that an earlier recipe trained."""
+    return networks.load(run.need(name, recipe), device=options.device)
+
+
+def load_demonstrations(run: Run) -> Demonstrations:
+    """Load the recorded demonstrations."""
+    return Demonstrations.load(run.need(DEMONSTRATIONS, "record_demonstrations"))
+
+
+def load_labels(run: Run) -> LabelReport:
+    """Load the inverse module's labels."""
+    return LabelReport.load(run.need(LABELS, "label"))
+
+
+def train(
+    options: DictConfig,
+    stage: Stage,
+    loss: nn.Module,
+    buffer: ReplayBuffer,
+    section: str,
+    file: str,
+) -> dict:
+    """Fit a network to a buffer, save it, and finish the stage."""
+    history = fit(
+        loss,
+        buffer,
+        fit_config(options[section]),
+        seed=options.seed,
+        name=stage.name,
+        checkpoint=stage.checkpoint,
+        checkpoint_seconds=options.checkpoint_seconds,
+        log=stage.log(),
+        progress=shows_progress(options),
+        settings=stage.settings,
+    )
+    networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
+    return stage.finish(history[-1], history)
+
+
+def fit_config(section: DictConfig) -> FitConfig:
+    """Return the part of a section that says how long and how fast to learn."""
+    return FitConfig(**_known(section, FitConfig))
+
+
+def self_examination_config(section: DictConfig) -> SelfExaminationConfig:
+    """Return the part of a section that says how the policy is improved."""
+    return SelfExaminationConfig(**_known(section, SelfExaminationConfig))
+
+
+def plain(node: Any) -> Any:
+    """Return options as dicts, lists and numbers."""
+    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+
+
+def _known(section: DictConfig, kind: Any) -> dict[str, Any]:
+    return {k: v for k, v in plain(section).items() if k in kind.__dataclass_fields__}

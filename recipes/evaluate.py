@@ -1,0 +1,132 @@
+"""Evaluate what a run has trained: success, chosen instructions, labels and judges."""
+
+from typing import Any
+
+import torch
+from _shared import (
+    CLASSIFIER,
+    GOAL,
+    POLICIES,
+    REWARD,
+    load_demonstrations,
+    load_network,
+    open_stage,
+    world,
+)
+from omegaconf import DictConfig
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.data import record_demonstrations
+from ifo_grounding.evaluation import (
+    compare_success,
+    return_correlation,
+    reward_audit,
+    success_rate,
+    suitable_rate,
+)
+from ifo_grounding.report import results_table
+from ifo_grounding.training import Run
+from ifo_grounding.transforms import LearnedReward
+
+HELD_OUT = 500
+"""Demonstrations, none of them trained on, that the action reward is compared with."""
+
+
+def evaluate(options: DictConfig) -> dict:
+    stages = ["label", "imitate", "train_instruction", "train_reward", "train_goal", "self_examine"]
+    stage = open_stage(options, "evaluate", ["evaluate"], needs=stages)
+    if stage.result is not None:
+        return stage.result
+    run = stage.run
+    # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
+    results: dict[str, Any] = {"labels": run.record("label")["result"]["accuracy"]}
+    results |= evaluate_policies(run, options)
+    if (run / CLASSIFIER).exists():
+        results["suitability"] = evaluate_choices(run, options)
+    results |= evaluate_judges(run, options)
+    return stage.finish(results)
+
+
+def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
+    """Measure success of the policy of each phase on the same fixed scenes, and the difference."""
+    section = options.evaluate
+    run.need(POLICIES[0], "imitate")
+    measured = [
+        success_rate(
+            load_network(run, file, "imitate", options),
+            options.task,
+            mode=section.mode,
+            episodes=section.episodes,
+            seed=section.seed,
+            stream=section.stream,
+            **evaluation_world(options),
+        )
+        for file in POLICIES
+        if (run / file).exists()
+    ]
+    results = {f"phase{place}": success.as_dict() for place, success in enumerate(measured, 1)}
+    outcomes = torch.stack([success.outcomes for success in measured])
+    torch.save(outcomes, run / "outcomes.pt")
+    if len(measured) == 2:
+        results["gain"] = compare_success(*measured).as_dict()
+    return results
+
+
+def evaluate_choices(run: Run, options: DictConfig) -> dict[str, Any]:
+    """Let the oracle judge the instructions that the instruction module chooses."""
+    section = options.instruction
+    result = suitable_rate(
+        load_network(run, CLASSIFIER, "train_instruction", options),
+        options.task,
+        load_demonstrations(run).pool(),
+        states=options.evaluate.states,
+        threshold=section.threshold,
+        candidates=section.candidates,
+        choose=section.choose,
+        seed=options.evaluate.seed,
+        stream=options.evaluate.stream,
+        **evaluation_world(options),
+    )
+    return result.as_dict()
+
+
+def evaluate_judges(run: Run, options: DictConfig) -> dict[str, Any]:
+    """Compare the judges with the expert's actions and with the true success of rollouts."""
+    results: dict[str, Any] = {}
+    policy = load_network(run, POLICIES[0], "imitate", options)
+    shown = evaluation_world(options)
+    audited = {
+        "episodes": options.evaluate.audit_episodes,
+        "seed": options.evaluate.seed,
+        "stream": options.evaluate.stream,
+        **shown,
+    }
+    if (run / REWARD).exists():
+        judge = load_network(run, REWARD, "train_reward", options)
+        demos, truth = record_demonstrations(
+            options.task, HELD_OUT, keep_truth=True, stream=options.evaluate.stream, **shown
+        )
+        results["action_reward"] = reward_audit(judge, demos, truth).as_dict()
+        audit = return_correlation(policy, judge, options.task, average=True, **audited)
+        results["action_return"] = audit.as_dict()
+    if (run / GOAL).exists():
+        judge = load_network(run, GOAL, "train_goal", options)
+        reward = LearnedReward(judge, "goal")
+        results["goal_return"] = return_correlation(
+            policy, reward, options.task, **audited
+        ).as_dict()
+    return results
+
+
+def evaluation_world(options: DictConfig) -> dict[str, Any]:
+    """Return the world's arguments with the split to evaluate on."""
+    return {**world(options), "split": options.evaluate.split}
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(results_table(evaluate(options)))
+
+
+if __name__ == "__main__":
+    main()

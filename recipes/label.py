@@ -1,0 +1,40 @@
+"""Label the demonstrations with the inverse module (paper, 1st-phase)."""
+
+from _shared import (
+    INVERSE,
+    LABELS,
+    TRUTH,
+    load_demonstrations,
+    load_network,
+    open_stage,
+    shows_progress,
+)
+from omegaconf import DictConfig
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.data import Truth, label_demonstrations
+from ifo_grounding.evaluation import label_accuracy
+
+
+def label(options: DictConfig) -> dict:
+    needs = ["record_demonstrations", "train_inverse"]
+    stage = open_stage(options, "label", [], needs)
+    if stage.result is not None:
+        return stage.result
+    demos = load_demonstrations(stage.run)
+    inverse = load_network(stage.run, INVERSE, "train_inverse", options)
+    _, report = label_demonstrations(demos, inverse, progress=shows_progress(options))
+    report.save(stage.run / LABELS)
+    # Only the evaluation reads the truth: nothing of it goes back into training.
+    truth = Truth.load(stage.run.need(TRUTH, "record_demonstrations"))
+    accuracy = label_accuracy(report.actions, truth)
+    return stage.finish({"confidence": report.summary(), "accuracy": accuracy.as_dict()})
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(label(options)["accuracy"])
+
+
+if __name__ == "__main__":
+    main()

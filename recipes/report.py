@@ -1,0 +1,129 @@
+"""Write the report of a run: table, curves, chosen instructions and episodes, as one page."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from _shared import CLASSIFIER, POLICIES, load_demonstrations, load_network, open_run
+from evaluate import evaluate, evaluation_world
+from omegaconf import DictConfig
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.evaluation import Rate, record_episodes
+from ifo_grounding.files import read_json
+from ifo_grounding.report import (
+    animation,
+    improved_episodes,
+    instruction_cases,
+    results_rows,
+    success_over_iterations,
+    training_curves,
+    write_report,
+)
+from ifo_grounding.training import Run
+
+CURVES = {
+    "imitate": ("Imitation", ["loss_imitation", "accuracy"]),
+    "train_instruction": (
+        "Instruction module",
+        ["positive_probability", "negative_probability", "removed"],
+    ),
+    "train_goal": ("Goal judge", ["final_probability", "unfinished_probability"]),
+    "train_reward": ("Reward module", ["positive_probability", "negative_probability"]),
+    "self_examine": (
+        "Self-examination",
+        ["learned_return", "episode_length", "stopped", "entropy", "served_share", "clip_fraction"],
+    ),
+}
+EPISODES = 4
+
+
+def report(options: DictConfig) -> Path:
+    run = open_run(options)
+    results = evaluate(options)
+    pictures: dict[str, Any] = episode_pictures(run, options)
+    if (run / CLASSIFIER).exists():
+        pictures["Chosen instructions"] = instruction_cases(
+            load_network(run, CLASSIFIER, "train_instruction", options),
+            options.task,
+            load_demonstrations(run).pool(),
+            threshold=options.instruction.threshold,
+            candidates=options.instruction.candidates,
+            choose=options.instruction.choose,
+            stream="validation",
+            **evaluation_world(options),
+        )
+    pictures |= curves(run)
+    return write_report(
+        run / "report",
+        {"Results": results_rows(results)},
+        pictures,
+        title=f"{options.task}, preset {options.network}",
+        summary=f"{options.demonstrations.n:,} demonstrations, seed {options.seed}, "
+        f"{options.evaluate.episodes:,} evaluation scenes ({options.evaluate.stream}).",
+    )
+
+
+def episode_pictures(run: Run, options: DictConfig) -> dict[str, Any]:
+    """Animate episodes: scenes that phase 2 gained and lost, or some of phase 1."""
+    found: dict[str, Any] = {}
+    policies = [
+        load_network(run, file, "imitate", options) for file in POLICIES if (run / file).exists()
+    ]
+    shown = {
+        "seed": options.evaluate.seed,
+        "stream": options.evaluate.stream,
+        "render_tile_size": 32,
+        **evaluation_world(options),
+    }
+    episodes = record_episodes(policies[-1], options.task, range(EPISODES), **shown)
+    found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES)
+    if len(policies) == 1:
+        return found
+    before, after = torch.load(run / "outcomes.pt", weights_only=True)
+    for title, changed in {
+        "Solved by phase 2 alone": after & ~before,
+        "Solved by phase 1 alone": before & ~after,
+    }.items():
+        scenes = changed.nonzero().squeeze(-1)[:EPISODES].tolist()
+        if scenes:
+            tries, titles = improved_episodes(
+                policies[0], policies[1], options.task, scenes, **shown
+            )
+            found[title] = animation(tries, titles=titles, columns=len(scenes))
+    return found
+
+
+def curves(run: Run) -> dict[str, Any]:
+    """Plot what was logged, stage by stage."""
+    found: dict[str, Any] = {}
+    for stage, (title, wanted) in CURVES.items():
+        path = run / "metrics" / f"{stage}.json"
+        if not path.exists():
+            continue
+        history = read_json(path)
+        metrics = {
+            name: ([row["step"] for row in history], [row[name] for row in history])
+            for name in wanted
+            if all(name in row for row in history)
+        }
+        found[title] = training_curves(metrics)
+        audited = [row for row in history if "success" in row]
+        if len(audited) > 1:
+            rates = [
+                Rate(row["success"], row["success_low"], row["success_high"], 0, 0)
+                for row in audited
+            ]
+            found["Success in training (validation scenes)"] = success_over_iterations(
+                [row["step"] for row in audited], rates
+            )
+    return found
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(report(options))
+
+
+if __name__ == "__main__":
+    main()

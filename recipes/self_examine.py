@@ -1,0 +1,112 @@
+"""Self-examination: practise chosen instructions under a learned reward (paper, Algorithm 1)."""
+
+from typing import Any
+
+import torch
+from _audit import audit_callback
+from _shared import (
+    CLASSIFIER,
+    GOAL,
+    POLICIES,
+    REWARD,
+    build,
+    load_demonstrations,
+    load_labels,
+    load_network,
+    open_stage,
+    plain,
+    self_examination_config,
+    shows_progress,
+    simulator,
+)
+from omegaconf import DictConfig
+from torchrl.envs import Compose, TransformedEnv
+
+from ifo_grounding import networks
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.data import labelled_buffer
+from ifo_grounding.objectives import RewardLoss
+from ifo_grounding.training import Adversary, select_pairs, self_examine
+from ifo_grounding.training.run import Run
+from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
+
+
+def examine(options: DictConfig) -> dict:
+    section = options.self_examine
+    judges = {"action": ["train_reward"], "goal": ["train_goal"]}.get(
+        section.kind, ["train_reward", "train_goal"]
+    )
+    needs = ["imitate", "train_instruction", *judges]
+    stage = open_stage(options, "self_examine", ["self_examine", "instruction"], needs)
+    if stage.result is not None:
+        return stage.result
+    run = stage.run
+    policy = load_network(run, POLICIES[0], "imitate", options)
+    value = build(networks.make_value, options, **plain(section.critic))
+    reward, adversary = learned_reward(run, options)
+    env = TransformedEnv(
+        simulator(options, section.num_envs), Compose(chosen_starts(run, options), reward)
+    )
+    history = self_examine(
+        env,
+        policy,
+        value,
+        self_examination_config(section),
+        seed=options.seed,
+        adversary=adversary,
+        checkpoint=stage.checkpoint,
+        log=stage.log(),
+        callback=audit_callback(policy, options),
+        progress=shows_progress(options),
+        settings=stage.settings,
+    )
+    networks.save(policy, run / POLICIES[1])
+    return stage.finish(history[-1], history)
+
+
+def learned_reward(run: Run, options: DictConfig) -> tuple[LearnedReward, Adversary | None]:
+    """Return the reward of the chosen kind and, where it is to be trained on, what does so."""
+    section = options.self_examine
+    judges: dict[str, Any] = {}
+    adversary = None
+    if section.kind != "goal":
+        judges["action"] = load_network(run, REWARD, "train_reward", options)
+    if section.kind != "action":
+        judges["goal"] = load_network(run, GOAL, "train_goal", options)
+    if "action" in judges and section.reward_steps:
+        demos = labelled_buffer(load_demonstrations(run), load_labels(run).actions)
+        adversary = Adversary(
+            RewardLoss(judges["action"]), demos, section.reward_steps, section.reward_lr
+        )
+    model, *rest = judges.values()
+    return LearnedReward(model, section.kind, goal_model=rest[0] if rest else None), adversary
+
+
+def chosen_starts(run: Run, options: DictConfig) -> InstructionSampler | StartingPairs:
+    """Return fresh states with chosen instructions, or the paper's fixed number of pairs."""
+    classifier = load_network(run, CLASSIFIER, "train_instruction", options)
+    pool = load_demonstrations(run).pool()
+    section = options.instruction
+    chosen = {name: section[name] for name in ("threshold", "candidates", "choose")}
+    if options.self_examine.pairs is None:
+        return InstructionSampler(classifier, pool, **chosen)
+    with torch.no_grad():
+        pairs = select_pairs(
+            simulator(options, options.self_examine.num_envs),
+            classifier,
+            pool,
+            options.self_examine.pairs,
+            seed=options.seed,
+            progress=shows_progress(options),
+            **chosen,
+        )
+    return StartingPairs(pairs)
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(examine(options))
+
+
+if __name__ == "__main__":
+    main()

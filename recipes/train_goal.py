@@ -1,0 +1,29 @@
+"""Train the goal judge: whether an instruction is fulfilled (an extension of the paper)."""
+
+from _shared import GOAL, build, load_demonstrations, open_stage, train
+from omegaconf import DictConfig
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.data import goal_buffer
+from ifo_grounding.networks import make_goal_judge
+from ifo_grounding.objectives import GoalLoss
+
+
+def train_goal(options: DictConfig) -> dict:
+    stage = open_stage(options, "train_goal", ["goal"], needs=["record_demonstrations"])
+    if stage.result is not None:
+        return stage.result
+    demos = load_demonstrations(stage.run)
+    loss = GoalLoss(
+        build(make_goal_judge, options), demos.pool(), removal_rate=options.goal.removal_rate
+    )
+    return train(options, stage, loss, goal_buffer(demos), "goal", GOAL)
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(train_goal(options))
+
+
+if __name__ == "__main__":
+    main()

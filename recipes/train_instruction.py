@@ -1,0 +1,46 @@
+"""Train the instruction module: which instructions suit a scene (paper, 2nd-phase)."""
+
+from _shared import (
+    CLASSIFIER,
+    POLICIES,
+    build,
+    load_demonstrations,
+    load_network,
+    open_stage,
+    train,
+)
+from omegaconf import DictConfig
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.data import first_frame_buffer
+from ifo_grounding.networks import make_instruction_classifier
+from ifo_grounding.objectives import InstructionLoss
+
+
+def train_instruction(options: DictConfig) -> dict:
+    starts_from_policy = options.instruction.init_from_policy
+    needs = ["record_demonstrations", *(["imitate"] if starts_from_policy else [])]
+    stage = open_stage(options, "train_instruction", ["instruction"], needs)
+    if stage.result is not None:
+        return stage.result
+    demos = load_demonstrations(stage.run)
+    policy = (
+        load_network(stage.run, POLICIES[0], "imitate", options) if starts_from_policy else None
+    )
+    loss = InstructionLoss(
+        build(make_instruction_classifier, options, init_from=policy),
+        demos.pool(),
+        negatives=options.instruction.negatives,
+        removal_rate=options.instruction.removal_rate,
+        warmup=options.instruction.removal_warmup,
+    )
+    return train(options, stage, loss, first_frame_buffer(demos), "instruction", CLASSIFIER)
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(train_instruction(options))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,27 @@
+"""Train the reward module: which actions are right (paper, 2nd-phase)."""
+
+from _shared import REWARD, build, load_demonstrations, load_labels, open_stage, train
+from omegaconf import DictConfig
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.data import labelled_buffer
+from ifo_grounding.networks import make_reward_model
+from ifo_grounding.objectives import RewardLoss
+
+
+def train_reward(options: DictConfig) -> dict:
+    stage = open_stage(options, "train_reward", ["reward"], needs=["label"])
+    if stage.result is not None:
+        return stage.result
+    buffer = labelled_buffer(load_demonstrations(stage.run), load_labels(stage.run).actions)
+    loss = RewardLoss(build(make_reward_model, options))
+    return train(options, stage, loss, buffer, "reward", REWARD)
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(train_reward(options))
+
+
+if __name__ == "__main__":
+    main()

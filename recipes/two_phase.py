@@ -1,0 +1,48 @@
+"""Both phases on one task, and a report: the main job."""
+
+from _shared import open_run, plain
+from collect_transitions import collect
+from evaluate import evaluate
+from imitate import imitate
+from label import label
+from omegaconf import DictConfig
+from record_demonstrations import record
+from self_examine import examine
+from train_goal import train_goal
+from train_instruction import train_instruction
+from train_inverse import train_inverse
+from train_reward import train_reward
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.files import write_json
+from ifo_grounding.report import results_table
+from report import report
+
+
+def two_phase(options: DictConfig) -> dict:
+    write_json(open_run(options) / "options.json", plain(options))
+    # Phase 1: imitation from observation.
+    collect(options)
+    train_inverse(options)
+    record(options)
+    label(options)
+    imitate(options)
+    # Phase 2: self-examination.
+    train_instruction(options)
+    if options.self_examine.kind != "goal":
+        train_reward(options)
+    if options.self_examine.kind != "action":
+        train_goal(options)
+    examine(options)
+    return evaluate(options)
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    results = two_phase(options)
+    page = report(options)
+    print(f"\n{results_table(results)}\n\nrun: {open_run(options).folder}\nreport: {page}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,228 @@
+"""What makes a function a recipe: options through Hydra, mistakes answered with one line."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import functools
+import inspect
+import io
+import os
+import sys
+from argparse import Namespace
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ifo_grounding.errors import UserError
+
+if TYPE_CHECKING:
+    from hydra.core.override_parser.types import Override
+    from omegaconf import DictConfig
+
+USAGE_ERROR = 2
+INTERRUPTED = 130
+_TAKES = {bool: "true or false", int: "a whole number", float: "a number", list: "a list"}
+
+
+def recipes_folder() -> Path:
+    """Folder of the recipes: inside an installed wheel, or at the top of a source checkout.
+
+    >>> (recipes_folder() / "conf" / "_hydra.yaml").is_file()
+    True
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / "recipes", package.parents[1] / "recipes"):
+        if (folder / "conf").is_dir():
+            return folder
+    raise UserError("this installation has no recipes: install ifo-grounding again")
+
+
+def recipe_names() -> list[str]:
+    """Names of all recipes, sorted."""
+    return sorted(path.stem for path in recipes_folder().glob("[!_]*.py"))
+
+
+@contextlib.contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Turn a :class:`UserError` into ``error: ...`` on stderr and exit code 2, without a traceback.
+
+    ``HYDRA_FULL_ERROR=1`` in the environment keeps the traceback.
+    """
+    try:
+        yield
+    except UserError as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        raise SystemExit(USAGE_ERROR) from None
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+
+
+def recipe_main(function: Callable[[DictConfig], object]) -> Callable[[], None]:
+    """Decorate the function of a recipe script, which takes the composed options.
+
+    The options come from ``conf/<script name>.yaml`` beside the script and from ``name=value``
+    on the command line. An unknown option, a value of the wrong kind and a :class:`UserError` of
+    the recipe itself become one line on stderr and exit code 2.
+
+    Example of a whole recipe ``recipes/greet.py``, with ``name: world`` in ``conf/greet.yaml``::
+
+        @recipe_main
+        def main(options):
+            print("hello", options.name)
+
+        if __name__ == "__main__":
+            main()
+    """
+    script = Path(inspect.getfile(function)).resolve()
+
+    @functools.wraps(function)
+    def job(options: DictConfig) -> None:
+        from omegaconf import MissingMandatoryValue
+
+        with one_line_errors():
+            try:
+                function(options)
+            except MissingMandatoryValue as error:
+                raise UserError(
+                    f"option {error.full_key!r} is required: give it a value"
+                ) from error
+
+    @functools.wraps(function)
+    def main() -> None:
+        with one_line_errors():
+            import hydra
+
+            conf = script.parent / "conf"
+            check_options(conf, script.stem, sys.argv[1:])
+            hydra.main(version_base=None, config_path=str(conf), config_name=script.stem)(job)()
+
+    return main
+
+
+def check_options(conf: Path, name: str, arguments: Sequence[str]) -> None:
+    """Raise :class:`UserError` for the first argument that the options do not offer."""
+    from hydra import initialize_config_dir
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    flags = _parse_flags(arguments)
+    name = flags.config_name or name
+    conf = Path(flags.config_path or conf).absolute()
+    if not (conf / f"{name}.yaml").is_file():
+        listed = ", ".join(sorted(path.stem for path in conf.glob("[!_]*.yaml")))
+        raise UserError(f"there are no options named {name!r} in {conf}: choose one of {listed}")
+    if flags.config_dir is not None or flags.hydra_help:
+        return
+    overrides = []
+    for text in flags.overrides:
+        try:
+            overrides.append(OverridesParser.create().parse_override(text))
+        except HydraException:
+            raise UserError(f"cannot read {text!r}: options are written name=value") from None
+    with initialize_config_dir(version_base=None, config_dir=str(conf), job_name=name):
+        _check_overrides(name, overrides, several=flags.multirun)
+
+
+def _parse_flags(arguments: Sequence[str]) -> Namespace:
+    from hydra._internal.utils import get_args_parser
+
+    said = io.StringIO()
+    parser = get_args_parser()
+    try:
+        with contextlib.redirect_stderr(said):
+            flags, unknown = parser.parse_known_args(arguments)
+    except SystemExit as exit_:
+        if not exit_.code:
+            raise
+        raise UserError(said.getvalue().rpartition("error: ")[2]) from None
+    unknown = [text for text in unknown if text.startswith("-")] or unknown
+    if unknown:
+        raise UserError(f"unknown flag {unknown[0]!r}: options are written name=value; see --help")
+    return flags
+
+
+def _check_overrides(name: str, overrides: Sequence[Override], several: bool) -> None:
+    from hydra import compose
+    from hydra.core.global_hydra import GlobalHydra
+
+    loader = GlobalHydra.instance().config_loader()
+    groups, values = [], []
+    for override in overrides:
+        key = override.key_or_group
+        if override.is_sweep_override() and not several:
+            raise UserError(f"option {key!r} got several values: add --multirun to run each")
+        allowed = loader.get_group_options(key)
+        if allowed and not override.is_delete():
+            _check_choices(override, allowed)
+            groups.append(override)
+        elif not override.is_hydra_override():
+            values.append(override)
+    chosen = [group.input_line or "" for group in groups if not group.is_sweep_override()]
+    defaults = compose(name, overrides=chosen)
+    choices = [group for group in loader.list_groups("") if group != "hydra"]
+    for override in values:
+        _check_value(defaults, override, choices)
+
+
+def _check_choices(override: Override, allowed: list[str]) -> None:
+    several = override.is_sweep_override()
+    wanted = list(override.sweep_string_iterator()) if several else [override.value()]
+    for choice in wanted:
+        if isinstance(choice, str) and choice not in allowed:
+            listed = ", ".join(allowed)
+            raise UserError(f"unknown {override.key_or_group} {choice!r}: choose one of {listed}")
+
+
+def _check_value(defaults: DictConfig, override: Override, choices: list[str]) -> None:
+    from omegaconf import OmegaConf
+
+    if override.is_add() or override.is_force_add():
+        return
+    key = override.key_or_group
+    section, name = _locate(defaults, key, choices)
+    if override.is_delete() or override.is_sweep_override():
+        return
+    if OmegaConf.is_missing(section, name) or OmegaConf.is_interpolation(section, name):
+        return  # what is required or composed of other options has no kind of its own
+    default, given = section[name], override.value()
+    kind = list if OmegaConf.is_list(default) else type(default)
+    if OmegaConf.is_dict(default) and not isinstance(given, dict):
+        listed = ", ".join(map(str, default))
+        raise UserError(
+            f"{key!r} is a section: set one of its options with {key}.name=value ({listed})"
+        )
+    if kind in _TAKES and not _fits(given, kind):
+        raise UserError(f"option {key!r} takes {_TAKES[kind]}, not {given!r}")
+
+
+def _fits(given: Any, kind: type) -> bool:
+    if kind is float:
+        return isinstance(given, (int, float)) and not isinstance(given, bool)
+    return type(given) is kind
+
+
+def _locate(defaults: DictConfig, key: str, choices: list[str]) -> tuple[DictConfig, str]:
+    """Return the section that holds an option, and the option's name there."""
+    from omegaconf import OmegaConf
+
+    section = defaults
+    *path, name = key.split(".")
+    for place, part in enumerate([*path, name]):
+        # Names are compared as listed: asking the section itself would resolve its values.
+        names = list(map(str, section.keys()))
+        if part not in names:
+            names = names if place else [*choices, *names]
+            close = difflib.get_close_matches(part, names, n=1)
+            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            where = f"{'.'.join(path[:place])!r} has" if place else "there are"
+            raise UserError(f"unknown option {key!r}{hint}: {where} {', '.join(names)}")
+        if place < len(path):
+            if OmegaConf.is_interpolation(section, part) or not OmegaConf.is_dict(section[part]):
+                plain = ".".join(path[: place + 1])
+                raise UserError(f"unknown option {key!r}: {plain!r} has no options of its own")
+            section = section[part]
+    return section, name

@@ -1,0 +1,39 @@
+"""Data: frames stored compactly, demonstrations without actions, transitions and labels."""
+
+from ifo_grounding.data.buffers import first_frame_buffer, goal_buffer
+from ifo_grounding.data.codec import FrameCodec
+from ifo_grounding.data.decoding import FrameDecoder, Lookup
+from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.labelling import (
+    Labelled,
+    LabelReport,
+    label_demonstrations,
+    labelled_buffer,
+)
+from ifo_grounding.data.recording import record_demonstrations
+from ifo_grounding.data.transitions import (
+    Collected,
+    RandomActions,
+    TransitionReport,
+    collect_transitions,
+)
+from ifo_grounding.data.truth import Truth
+
+__all__ = [
+    "Collected",
+    "Demonstrations",
+    "FrameCodec",
+    "FrameDecoder",
+    "LabelReport",
+    "Labelled",
+    "Lookup",
+    "RandomActions",
+    "TransitionReport",
+    "Truth",
+    "collect_transitions",
+    "first_frame_buffer",
+    "goal_buffer",
+    "label_demonstrations",
+    "labelled_buffer",
+    "record_demonstrations",
+]

@@ -1,0 +1,101 @@
+"""Replay buffers of demonstrations for the judges, which need no actions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose
+
+from ifo_grounding import keys
+from ifo_grounding.data.decoding import FrameDecoder, Lookup
+from ifo_grounding.data.demonstrations import Demonstrations
+
+FINAL = "final"
+
+
+def first_frame_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer:
+    """Put first frames and instructions into a replay buffer: the instruction module's positives.
+
+    A sample holds ``pixels`` uint8 [B, C, H, W] and ``instruction`` int64 [B, L].
+
+    Args:
+        demos: demonstrations; the buffer shares their frames.
+        options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``sampler``.
+
+    >>> frames = [torch.zeros(3, 3, 48, 48, dtype=torch.uint8) for _ in range(5)]
+    >>> demos = Demonstrations.from_arrays(frames, ["go up"] * 5)
+    >>> len(first_frame_buffer(demos))
+    5
+    """
+    stored = {keys.PIXELS: demos.starts, keys.INSTRUCTION: torch.arange(len(demos))}
+    return frame_buffer(demos, stored, [keys.PIXELS], **options)
+
+
+def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer:
+    """Put final and earlier frames into a replay buffer, half of each, for the goal judge.
+
+    A sample holds ``initial_pixels`` and ``pixels`` uint8 [B, C, H, W], ``instruction`` int64
+    [B, L] and ``final`` bool [B, 1]. Earlier frames that look like the last one are left out: the
+    stop repeats it.
+
+    Args:
+        demos: demonstrations that end in success; the buffer shares their frames.
+        options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``sampler``.
+
+    >>> frames = [torch.arange(3, dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 48, 48)]
+    >>> buffer = goal_buffer(Demonstrations.from_arrays(frames, ["go up"]))
+    >>> buffer[:]["final"].flatten().tolist()
+    [False, False, True, True]
+    """
+    lengths = demos.lengths
+    episode = torch.arange(len(demos)).repeat_interleave(lengths)
+    step = torch.arange(len(episode)) - (lengths.cumsum(0) - lengths)[episode]
+    frame = demos.starts[episode] + step
+    last = demos.starts + lengths - 1
+    earlier = (demos.codes[frame] != demos.codes[last[episode]]).flatten(1).any(1)
+    balance = torch.zeros(len(demos), dtype=torch.int64).scatter_add_(0, episode, earlier.long())
+    finished = torch.arange(len(demos)).repeat_interleave(balance.clamp(min=1))
+    episodes = torch.cat([episode[earlier], finished])
+    final = torch.zeros(len(episodes), 1, dtype=torch.bool)
+    final[int(earlier.sum()) :] = True
+    stored = {
+        keys.INITIAL_PIXELS: demos.starts[episodes],
+        keys.PIXELS: torch.cat([frame[earlier], last[finished]]),
+        keys.INSTRUCTION: episodes,
+        FINAL: final,
+    }
+    return frame_buffer(demos, stored, [keys.INITIAL_PIXELS, keys.PIXELS], **options)
+
+
+def frame_buffer(
+    demos: Demonstrations,
+    stored: dict[NestedKey, Tensor],
+    frame_keys: list[NestedKey],
+    **options: Any,
+) -> TensorDictReplayBuffer:
+    """Put entries that name frames and episodes by number into a buffer that looks them up.
+
+    Args:
+        demos: demonstrations; the buffer shares their frames.
+        stored: entries [N, ...]: numbers of frames at ``frame_keys``, the number of the episode at
+            ``instruction``, and whatever else.
+        frame_keys: which entries are frames.
+        options: for ``TensorDictReplayBuffer``.
+    """
+    entries = TensorDict(stored, [len(stored[keys.INSTRUCTION])])
+    for key in [*frame_keys, keys.INSTRUCTION]:
+        entries[key] = entries[key].int()
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(len(entries)),
+        transform=Compose(
+            FrameDecoder(demos.codec, frame_keys, frames=demos.codes),
+            Lookup(demos.tokens, [keys.INSTRUCTION]),
+        ),
+        **options,
+    )
+    buffer.extend(entries)
+    return buffer

@@ -1,0 +1,321 @@
+"""Frames stored without loss as mosaics: distinct tiles once, and per frame their numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from ifo_grounding import mosaic
+from ifo_grounding.data._tile_index import TileIndex
+from ifo_grounding.errors import UserError
+
+TILE_SIZES = (8, 16, 32, 64)
+CODE_DTYPES = (torch.uint8, torch.int16, torch.int32)
+CHUNK_BYTES = 4 << 20
+SAMPLE_FRAMES = 256
+PATIENCE_FRAMES = 4096
+PIECE_FRAMES = 2048
+
+
+class FrameCodec:
+    """Lossless codec of uint8 images, a dictionary of tiles learned from the images themselves.
+
+    An image [C, H, W] is cut into T x T tiles; its code is the grid of their numbers in the
+    dictionary, as uint8, int16 or int32, whichever is the smallest that fits. Images of a simulator
+    shrink about a hundredfold. Where tiles do not repeat, or no tile size divides the image, the
+    codec is *raw*: codes are the pixels themselves, and every method works just the same.
+
+    Args:
+        image_shape: (C, H, W) of the images.
+        tiles: distinct tiles, uint8 [N, C, T, T]; None for a raw codec.
+
+    Raises:
+        UserError: where tiles and image shape do not fit.
+
+    >>> frames = torch.zeros(100, 3, 48, 48, dtype=torch.uint8)
+    >>> codec = FrameCodec.fit(frames)
+    >>> codes = codec.encode(frames)
+    >>> codes.dtype, codes.shape
+    (torch.uint8, torch.Size([100, 3, 3]))
+    >>> bool((codec.decode(codes) == frames).all())
+    True
+    """
+
+    def __init__(self, image_shape: Sequence[int], tiles: Tensor | None = None) -> None:
+        channels, height, width = (int(side) for side in image_shape)
+        self.image_shape = (channels, height, width)
+        self._index: TileIndex | None = None
+        if tiles is not None:
+            self._index = TileIndex(mosaic.words(tiles).flatten(1))
+            side = tiles.shape[-1]
+            if tiles.shape[1:] != (channels, side, side) or height % side or width % side:
+                raise UserError(
+                    f"tiles {list(tiles.shape)} do not cover images {list(self.image_shape)}: "
+                    f"give [N, {channels}, T, T] with T a divisor of height and width"
+                )
+        self.tile_size = None if tiles is None else int(tiles.shape[-1])
+
+    @property
+    def tiles(self) -> Tensor | None:
+        """Distinct tiles, uint8 [N, C, T, T]; None where the codec is raw."""
+        words = self.words
+        return None if words is None else words.view(torch.uint8)
+
+    @property
+    def words(self) -> Tensor | None:
+        """Tiles as 64-bit words, int64 [N, C, T, T / 8]; None where the codec is raw."""
+        if self._index is None or self.tile_size is None:
+            return None
+        shape = (-1, self.image_shape[0], self.tile_size, self.tile_size // mosaic.PIXELS_PER_WORD)
+        return self._index.words.view(len(self._index), *shape[1:])
+
+    @property
+    def code_shape(self) -> tuple[int, ...]:
+        """Shape of one image's code: (rows, columns), or (C, H, W) where the codec is raw."""
+        _, height, width = self.image_shape
+        if self.tile_size is None:
+            return self.image_shape
+        return (height // self.tile_size, width // self.tile_size)
+
+    @property
+    def code_dtype(self) -> torch.dtype:
+        """Smallest integer type that holds every tile number."""
+        return torch.uint8 if self._index is None else smallest_dtype(len(self._index))
+
+    def __repr__(self) -> str:
+        shape = "x".join(map(str, self.image_shape))
+        if self._index is None:
+            return f"FrameCodec({shape}, raw)"
+        return f"FrameCodec({shape}, {len(self._index)} tiles of {self.tile_size})"
+
+    @classmethod
+    def fit(cls, frames: Tensor | Iterable[Tensor], tile_size: int | None = None) -> FrameCodec:
+        """Return a codec that covers ``frames``; see :meth:`compress`."""
+        return cls.compress(frames, tile_size)[0]
+
+    @classmethod
+    def compress(
+        cls, frames: Tensor | Iterable[Tensor], tile_size: int | None = None
+    ) -> tuple[FrameCodec, Tensor]:
+        """Fit a codec and encode in one pass.
+
+        Args:
+            frames: images, uint8 [F, C, H, W], or an iterable of such pieces, which may come from
+                disk: pixels of one piece are in memory at a time.
+            tile_size: 8, 16, 32 or 64; the cheapest one by default.
+
+        Returns:
+            The codec, raw where a dictionary would not save memory, and codes [F, *code_shape].
+
+        Raises:
+            UserError: for images of another type or shape, or a tile size that does not fit them.
+        """
+        total = len(frames) if isinstance(frames, Tensor) else None
+        pieces = iter([frames] if isinstance(frames, Tensor) else frames)
+        first = next(pieces, None)
+        if first is None:
+            raise UserError("no frames: give at least one piece, uint8 [F, C, H, W]")
+        image_shape = _checked(first).shape[1:]
+        codec = cls._empty(image_shape, _tile_size(first, total or len(first), tile_size))
+        parts: list[Tensor] = []
+        seen = 0
+        for piece in _chain(first, pieces):
+            parts.append(codec.update(piece))
+            seen += len(piece)
+            if seen >= PATIENCE_FRAMES and not codec._saves(seen):
+                codec = codec._give_up(parts)
+        if not codec._saves(seen):
+            codec = codec._give_up(parts)
+        return codec, join(parts, codec.code_dtype)
+
+    @classmethod
+    def from_tiles(
+        cls,
+        tiles: Tensor,
+        parts: list[Tensor],
+        generator: torch.Generator | None = None,
+    ) -> tuple[FrameCodec, Tensor]:
+        """Return a codec and codes from tile numbers that a renderer gave.
+
+        Tiles that no frame shows are left out, equal ones become one, and numbers are drawn at
+        random: codes then say nothing that pixels do not.
+
+        Args:
+            tiles: pictures, uint8 [N, C, T, T].
+            parts: tile numbers, integer [F, rows, columns] each. The list is emptied on the way, so
+                that numbers and codes are not both in memory.
+            generator: decides the new numbers.
+
+        >>> tiles = torch.arange(3, dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 8, 8)
+        >>> codec, codes = FrameCodec.from_tiles(tiles, [torch.tensor([[[0, 2], [2, 2]]])])
+        >>> codec.decode(codes)[0, 0, ::8, ::8].tolist(), len(codec.tiles)
+        ([[0, 2], [2, 2]], 2)
+        """
+        if not parts:
+            raise UserError("no frames: give at least one part, integer [F, rows, columns]")
+        rows, columns = parts[0].shape[1:]
+        side = tiles.shape[-1]
+        used = torch.zeros(len(tiles), dtype=torch.bool)
+        for part in parts:
+            for piece in part.split(PIECE_FRAMES):
+                used[piece.flatten().long()] = True
+        distinct = TileIndex(torch.empty(0, tiles[0].numel() // mosaic.PIXELS_PER_WORD).long())
+        numbers = torch.zeros(len(tiles), dtype=torch.int64)
+        numbers[used] = distinct.add(mosaic.words(tiles[used]).flatten(1))
+        order = torch.randperm(len(distinct), generator=generator)
+        numbers = order.argsort()[numbers]
+        shown = distinct.words[order].view(torch.uint8).view(-1, *tiles.shape[1:])
+        codec = cls((tiles.shape[1], rows * side, columns * side), shown)
+
+        codes = torch.empty(sum(map(len, parts)), rows, columns, dtype=codec.code_dtype)
+        numbers = numbers.to(codec.code_dtype)
+        end = len(codes)
+        while parts:
+            part = parts.pop()
+            end -= len(part)
+            for offset in range(0, len(part), PIECE_FRAMES):
+                piece = part[offset : offset + PIECE_FRAMES]
+                codes[end + offset : end + offset + len(piece)] = numbers[piece.long()]
+        return codec, codes
+
+    def encode(self, frames: Tensor) -> Tensor:
+        """Return the codes of ``frames``, uint8 [*B, C, H, W], as [*B, *code_shape].
+
+        Raises:
+            UserError: where a frame shows a tile that the dictionary lacks (see :meth:`update`).
+        """
+        return self._encode(frames, grow=False)
+
+    def update(self, frames: Tensor) -> Tensor:
+        """Add the tiles of ``frames`` to the dictionary and return their codes.
+
+        Earlier codes stay valid; their type may become too small for the later ones.
+        """
+        return self._encode(frames, grow=True)
+
+    def decode(self, codes: Tensor) -> Tensor:
+        """Return the pixels of ``codes`` [*B, *code_shape], uint8 [*B, C, H, W]."""
+        words = self.words
+        return codes if words is None else decode(words.to(codes.device), codes)
+
+    def _encode(self, frames: Tensor, grow: bool) -> Tensor:
+        if _checked(frames, frames.ndim).shape[-3:] != self.image_shape:
+            raise UserError(
+                f"frames are {list(frames.shape[-3:])}, this codec's are {list(self.image_shape)}"
+            )
+        if self._index is None or self.tile_size is None:
+            return frames
+        batch = frames.shape[:-3]
+        frames = frames.reshape(-1, *self.image_shape)
+        chunk = max(1, CHUNK_BYTES // math.prod(self.image_shape))
+        parts = []
+        for piece in frames.split(chunk):
+            tiles = cut(piece, self.tile_size)
+            numbers = self._index.add(tiles) if grow else self._index.find(tiles)
+            parts.append(numbers.to(self.code_dtype))
+        return join(parts, self.code_dtype).view(*batch, *self.code_shape)
+
+    @classmethod
+    def _empty(cls, image_shape: Sequence[int], tile_size: int | None) -> FrameCodec:
+        if tile_size is None:
+            return cls(image_shape)
+        shape = (0, image_shape[0], tile_size, tile_size)
+        return cls(image_shape, torch.empty(shape, dtype=torch.uint8))
+
+    def _saves(self, frames: int) -> bool:
+        """Tell whether the dictionary and the codes of so many frames are smaller than pixels."""
+        if self._index is None:
+            return True
+        code = math.prod(self.code_shape) * self.code_dtype.itemsize
+        tile = math.prod(self.image_shape) // math.prod(self.code_shape)
+        return len(self._index) * tile + frames * code <= frames * math.prod(self.image_shape)
+
+    def _give_up(self, parts: list[Tensor]) -> FrameCodec:
+        """Turn codes back into pixels, in place, and return a raw codec."""
+        for number, part in enumerate(parts):
+            parts[number] = self.decode(part.view(-1, *self.code_shape))
+        return FrameCodec(self.image_shape)
+
+
+def decode(words: Tensor, codes: Tensor) -> Tensor:
+    """Return pixels uint8 [*B, C, H, W] of tile numbers [*B, rows, columns]; see ``mosaic.words``.
+
+    Done in pieces that fit a processor's cache.
+    """
+    per_frame = words[0].numel() * math.prod(codes.shape[-2:]) * 8 if len(words) else 1
+    chunk = max(1, CHUNK_BYTES // max(per_frame, 1))
+    flat = codes.reshape(-1, *codes.shape[-2:])
+    if codes.is_cuda or len(flat) <= chunk:
+        return mosaic.assemble(words, codes)
+    channels, side = words.shape[1:3]
+    shape = (channels, codes.shape[-2] * side, codes.shape[-1] * side)
+    pixels = torch.empty(len(flat), *shape, dtype=torch.uint8)
+    for offset in range(0, len(flat), chunk):
+        pixels[offset : offset + chunk] = mosaic.assemble(words, flat[offset : offset + chunk])
+    return pixels.view(*codes.shape[:-2], *shape)
+
+
+def cut(frames: Tensor, tile_size: int) -> Tensor:
+    """Cut frames, uint8 [F, C, H, W], into tiles as words, int64 [F * rows * columns, K]."""
+    count, channels, height, width = frames.shape
+    words = frames.contiguous().view(torch.int64)
+    across = tile_size // mosaic.PIXELS_PER_WORD
+    grid = (count, channels, height // tile_size, tile_size, width // tile_size, across)
+    return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)
+
+
+def smallest_dtype(count: int) -> torch.dtype:
+    """Return the smallest of uint8, int16 and int32 that holds ``0 .. count - 1``."""
+    return next(dtype for dtype in CODE_DTYPES if count - 1 <= torch.iinfo(dtype).max)
+
+
+def join(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
+    """Concatenate codes as ``dtype``; the list is emptied, so that not both are in memory."""
+    if len(parts) == 1:
+        return parts.pop().to(dtype)
+    joined = torch.empty(sum(map(len, parts)), *parts[0].shape[1:], dtype=dtype)
+    end = len(joined)
+    while parts:
+        part = parts.pop()
+        joined[end - len(part) : end] = part
+        end -= len(part)
+    return joined
+
+
+def _chain(first: Tensor, rest: Iterator[Tensor]) -> Iterator[Tensor]:
+    yield first
+    yield from rest
+
+
+def _checked(frames: Tensor, ndim: int = 4) -> Tensor:
+    if not isinstance(frames, Tensor) or frames.dtype != torch.uint8 or frames.ndim != max(ndim, 3):
+        kind = getattr(frames, "dtype", type(frames).__name__)
+        shape = list(getattr(frames, "shape", []))
+        raise UserError(f"frames must be a uint8 tensor [F, C, H, W], got {kind} {shape}")
+    return frames
+
+
+def _tile_size(frames: Tensor, total: int, asked: int | None) -> int | None:
+    """Return the tile size that seems cheapest on a sample of the frames; None where none fits."""
+    height, width = frames.shape[-2:]
+    fitting = [size for size in TILE_SIZES if height % size == 0 and width % size == 0 and height]
+    if asked is not None:
+        if asked not in fitting:
+            raise UserError(
+                f"tile size {asked} does not divide images of {height} x {width} pixels: "
+                f"choose one of {fitting}, or none for pixels as they are"
+            )
+        return asked
+    if len(fitting) < 2 or not len(frames):
+        return fitting[0] if fitting else None
+    sample = frames[:: -(-len(frames) // SAMPLE_FRAMES)]
+    costs = {}
+    for size in fitting:
+        codec = FrameCodec._empty(frames.shape[1:], size)
+        code = codec.update(sample)[0]
+        tiles = codec.tiles
+        costs[size] = (0 if tiles is None else tiles.numel()) + total * code.nbytes
+    return min(costs, key=costs.__getitem__)

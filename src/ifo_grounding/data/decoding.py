@@ -1,0 +1,124 @@
+"""Replay buffer transforms that turn what is stored into what is sampled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import Transform
+
+from ifo_grounding import keys
+from ifo_grounding.data.codec import FrameCodec, decode
+
+FRAME_KEYS: tuple[NestedKey, ...] = (keys.PIXELS, (keys.NEXT, keys.PIXELS))
+
+
+class FrameDecoder(Transform):
+    """Decodes frames when a replay buffer is sampled, and encodes them when it is extended.
+
+    The buffer stores codes of a :class:`~ifo_grounding.data.FrameCodec`, or, where ``frames`` is
+    given, rows of that table of codes, so that transitions share frames. ``buffer.transform.to(
+    device)`` makes it decode there.
+
+    Args:
+        codec: decodes codes, and encodes the pixels of new entries.
+        in_keys: entries with codes; by default ``pixels`` and ``("next", "pixels")``.
+        out_keys: where the pixels go; by default the same entries.
+        frames: codes of all frames, [F, *codec.code_shape]; entries are then integers [*B], and
+            the buffer takes no pixels.
+
+    >>> import torch
+    >>> from tensordict import TensorDict
+    >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+    >>> pixels = torch.zeros(10, 3, 48, 48, dtype=torch.uint8)
+    >>> decoder = FrameDecoder(FrameCodec.fit(pixels), in_keys=["pixels"])
+    >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), transform=decoder)
+    >>> indices = buffer.extend(TensorDict({"pixels": pixels}, [10]))
+    >>> buffer.storage.get(slice(None))["pixels"].shape, buffer.sample(4)["pixels"].shape
+    (torch.Size([10, 6, 6]), torch.Size([4, 3, 48, 48]))
+    """
+
+    words: Tensor | None
+    frames: Tensor | None
+
+    def __init__(
+        self,
+        codec: FrameCodec,
+        in_keys: Sequence[NestedKey] = FRAME_KEYS,
+        out_keys: Sequence[NestedKey] | None = None,
+        frames: Tensor | None = None,
+    ) -> None:
+        out_keys = list(in_keys if out_keys is None else out_keys)
+        encodes = frames is None
+        super().__init__(
+            in_keys=list(in_keys),
+            out_keys=out_keys,
+            in_keys_inv=list(in_keys) if encodes else [],
+            out_keys_inv=list(out_keys) if encodes else [],
+        )
+        self.codec = codec
+        self.register_buffer("words", codec.words)
+        self.register_buffer("frames", frames, persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Decode the entries of a sample."""
+        return super().forward(_follow(tensordict, self.words))
+
+    def _apply_transform(self, codes: Tensor) -> Tensor:
+        if self.frames is not None:
+            codes = self.frames[codes.to(self.frames.device).long()]
+        if self.words is None:
+            return codes
+        return decode(self.words, codes.to(self.words.device))
+
+    def _inv_apply_transform(self, pixels: Tensor) -> Tensor:
+        return self.codec.encode(pixels.cpu())
+
+
+class Lookup(Transform):
+    """Replaces row numbers by rows of a table when a replay buffer is sampled.
+
+    Args:
+        table: [N, *S]; integers come out as int64.
+        in_keys: entries with row numbers, integer [*B].
+        out_keys: where the rows go, [*B, *S]; by default the same entries.
+
+    >>> import torch
+    >>> from tensordict import TensorDict
+    >>> lookup = Lookup(torch.tensor([[5, 6], [7, 8]]), in_keys=["instruction"])
+    >>> lookup(TensorDict({"instruction": torch.tensor([1, 1, 0])}, [3]))["instruction"].tolist()
+    [[7, 8], [7, 8], [5, 6]]
+    """
+
+    table: Tensor
+
+    def __init__(
+        self,
+        table: Tensor,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(
+            in_keys=list(in_keys), out_keys=list(in_keys if out_keys is None else out_keys)
+        )
+        self.register_buffer("table", table, persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Look up the entries of a sample."""
+        return super().forward(_follow(tensordict, self.table))
+
+    def _apply_transform(self, number: Tensor) -> Tensor:
+        rows = self.table[number.to(self.table.device).long()]
+        return rows if rows.dtype.is_floating_point else rows.long()
+
+
+def _follow(tensordict: TensorDictBase, table: Tensor | None) -> TensorDictBase:
+    """Copy a sample, without its tensors, to where the table is.
+
+    A full buffer hands out its own storage when all of it is asked for: writing there would spoil
+    it.
+    """
+    if table is None or tensordict.device in (None, table.device):
+        return tensordict.clone(recurse=False)
+    return tensordict.to(table.device)

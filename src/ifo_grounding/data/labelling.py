@@ -1,0 +1,232 @@
+"""Actions for demonstrations that have none: an inverse model names what each transition shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+from tqdm import tqdm
+
+from ifo_grounding import keys
+from ifo_grounding.data.buffers import FINAL, frame_buffer
+from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.folder import fact, load_folder, save_folder
+from ifo_grounding.errors import UserError
+
+KIND = "ifo-grounding labels"
+VERSION = 1
+QUANTILES = {"min": 0.0, "p01": 0.01, "p10": 0.1, "median": 0.5}
+
+
+@dataclass(frozen=True)
+class LabelReport:
+    """What the inverse model said, and how sure it was.
+
+    >>> report = LabelReport(torch.tensor([0, 0, 2]), torch.tensor([0.9, 1.0, 0.5]), n_actions=3)
+    >>> report.counts.tolist(), report.summary()[2]["mean"]
+    ([2, 0, 1], 0.5)
+    """
+
+    actions: Tensor
+    """Label of each transition, in the order of ``Demonstrations.locate()``, integer [M]."""
+    confidence: Tensor
+    """Probability that the model gave to its label, float32 [M]."""
+    n_actions: int
+    """Number of actions."""
+
+    @property
+    def counts(self) -> Tensor:
+        """Labels of each action, int64 [n_actions]."""
+        return self.actions.long().bincount(minlength=self.n_actions)
+
+    def summary(self) -> list[dict[str, float]]:
+        """Return count, mean, and low quantiles of the confidence for each action."""
+        rows = []
+        for action, count in enumerate(self.counts.tolist()):
+            values = self.confidence[self.actions == action].double().numpy()
+            row: dict[str, float] = {"action": action, "count": count}
+            if count:
+                row["mean"] = float(values.mean())
+                levels = torch.tensor(list(QUANTILES.values()), dtype=torch.float64)
+                ranks = (levels * (count - 1)).floor().long()
+                ordered = torch.from_numpy(values).sort().values[ranks]
+                row.update(zip(QUANTILES, ordered.tolist(), strict=True))
+            rows.append(row)
+        return rows
+
+    def __str__(self) -> str:
+        names = ("count", "mean", *QUANTILES)
+        lines = ["action " + "".join(f"{name:>9}" for name in names)]
+        for row in self.summary():
+            cells = [f"{row[name]:9.4f}" if name in row else " " * 9 for name in names[1:]]
+            lines.append(f"{row['action']:<7}{row['count']:>9}" + "".join(cells))
+        return "\n".join(lines)
+
+    def save(self, folder: str | Path) -> None:
+        """Write a folder; :func:`labelled_buffer` makes the buffer again from it."""
+        arrays = {"actions": self.actions, "confidence": self.confidence}
+        save_folder(folder, KIND, VERSION, arrays, {"n_actions": self.n_actions})
+
+    @classmethod
+    def load(cls, folder: str | Path) -> LabelReport:
+        """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`."""
+        arrays, facts = load_folder(folder, KIND, VERSION, ("actions", "confidence"))
+        n_actions = fact(facts, "n_actions", int)
+        actions, confidence = arrays["actions"], arrays["confidence"]
+        if actions.shape != confidence.shape or actions.ndim != 1:
+            raise UserError(f"{folder} is damaged: actions and confidence are not of one length")
+        if len(actions) and not 0 <= int(actions.min()) <= int(actions.max()) < n_actions:
+            raise UserError(f"{folder} is damaged: it holds an action outside 0..{n_actions - 1}")
+        return cls(actions, confidence, n_actions)
+
+
+class Labelled(NamedTuple):
+    """A labelled replay buffer, and how sure the labels are."""
+
+    buffer: TensorDictReplayBuffer
+    """Samples hold ``pixels``, ``instruction``, ``action``, ``final``; see labelled_buffer."""
+    report: LabelReport
+    """Labels and confidence."""
+
+
+def label_demonstrations(
+    demos: Demonstrations,
+    inverse: TensorDictModuleBase,
+    *,
+    batch_size: int = 4096,
+    device: torch.device | str | None = None,
+    progress: bool = True,
+    logits_key: NestedKey = keys.LOGITS,
+    **buffer_options: Any,
+) -> Labelled:
+    """Label every transition of demonstrations with an inverse model (paper, "Labelling").
+
+    The model runs in eval mode without gradients; its mode is then what it was.
+
+    Args:
+        demos: demonstrations.
+        inverse: reads ``pixels`` and ``("next", "pixels")``, writes logits [B, A].
+        batch_size: transitions at once.
+        device: where to run; by default where the model is.
+        progress: whether to show a bar.
+        logits_key: where the model writes.
+        buffer_options: for :func:`labelled_buffer`.
+
+    Returns:
+        The labelled buffer, which decodes frames when sampled, and a report of confidence.
+
+    Raises:
+        UserError: where no episode has two frames, or the model writes no such logits.
+    """
+    if not demos.transitions:
+        raise UserError("there is nothing to label: no episode has two frames")
+    if batch_size < 1:
+        raise UserError(f"batch_size must be at least 1, got {batch_size}")
+    device = torch.device(device) if device is not None else _device(inverse)
+    frame = demos.locate()[1]
+    modes = {module: module.training for module in inverse.modules()}
+    inverse.eval()
+    labels, sure, n_actions = [], [], 0
+    try:
+        with torch.no_grad(), tqdm(total=len(frame), desc="label", disable=not progress) as bar:
+            for numbers in frame.split(batch_size):
+                logits = _logits(demos, inverse, numbers, device, logits_key)
+                n_actions = logits.shape[-1]
+                best = logits.float().softmax(-1).max(-1)
+                labels.append(best.indices.to("cpu", torch.uint8))
+                sure.append(best.values.cpu())
+                bar.update(len(numbers))
+    finally:
+        for module, mode in modes.items():
+            module.training = mode
+    report = LabelReport(torch.cat(labels), torch.cat(sure), n_actions)
+    return Labelled(labelled_buffer(demos, report.actions, **buffer_options), report)
+
+
+def labelled_buffer(
+    demos: Demonstrations,
+    actions: Tensor,
+    *,
+    next_pixels: bool = False,
+    initial_pixels: bool = False,
+    generator: torch.Generator | None = None,
+    **options: Any,
+) -> TensorDictReplayBuffer:
+    """Put demonstrations and labels into a replay buffer, which shares the demonstrations' frames.
+
+    Entry number i is transition number i of ``demos.locate()``. A sample holds ``pixels`` uint8
+    [B, C, H, W], ``instruction`` int64 [B, L], ``action`` int64 [B], and ``final`` bool [B, 1],
+    true for the last transition of a demonstration. A transition takes 17 to 25 bytes.
+
+    Args:
+        demos: demonstrations.
+        actions: label of each transition, integer [M].
+        next_pixels: whether samples also hold ``("next", "pixels")``.
+        initial_pixels: whether samples also hold ``initial_pixels``, the episode's first frame.
+        generator: of the sampler.
+        options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``sampler``.
+
+    Raises:
+        UserError: where there is not one label for each transition.
+
+    >>> frames = [torch.zeros(3, 3, 48, 48, dtype=torch.uint8) for _ in range(5)]
+    >>> demos = Demonstrations.from_arrays(frames, ["go up"] * 5)
+    >>> buffer = labelled_buffer(demos, torch.zeros(10).long())
+    >>> buffer.sample(4)["pixels"].shape
+    torch.Size([4, 3, 48, 48])
+    """
+    if actions.shape != (demos.transitions,):
+        raise UserError(
+            f"there are {demos.transitions} transitions, but labels {list(actions.shape)}: were "
+            "they made for these demonstrations?"
+        )
+    episode, frame = demos.locate()
+    last = demos.starts + demos.lengths - 2
+    stored: dict[NestedKey, Tensor] = {
+        keys.PIXELS: frame,
+        keys.INSTRUCTION: episode,
+        keys.ACTION: actions.long(),
+        FINAL: (frame == last[episode]).unsqueeze(-1),
+    }
+    frame_keys: list[NestedKey] = [keys.PIXELS]
+    if next_pixels:
+        stored[keys.NEXT, keys.PIXELS] = frame + 1
+        frame_keys.append((keys.NEXT, keys.PIXELS))
+    if initial_pixels:
+        stored[keys.INITIAL_PIXELS] = demos.starts[episode]
+        frame_keys.append(keys.INITIAL_PIXELS)
+    return frame_buffer(demos, stored, frame_keys, generator=generator, **options)
+
+
+def _logits(
+    demos: Demonstrations,
+    inverse: TensorDictModuleBase,
+    frame: Tensor,
+    device: torch.device,
+    logits_key: NestedKey,
+) -> Tensor:
+    pair = TensorDict(
+        {
+            keys.PIXELS: demos.frames(frame).to(device),
+            keys.NEXT: {keys.PIXELS: demos.frames(frame + 1).to(device)},
+        },
+        [len(frame)],
+    )
+    logits = inverse(pair).get(logits_key, None)
+    if logits is None or logits.ndim != 2 or len(logits) != len(frame):
+        found = "nothing" if logits is None else list(logits.shape)
+        raise UserError(f"the inverse model wrote {found} at {logits_key!r}, not logits [B, A]")
+    return logits
+
+
+def _device(module: torch.nn.Module) -> torch.device:
+    """Return where a module's first parameter or buffer is."""
+    for tensor in (*module.parameters(), *module.buffers()):
+        return tensor.device
+    return torch.device("cpu")

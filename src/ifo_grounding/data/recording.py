@@ -1,0 +1,161 @@
+"""Recording an expert of the simulated world, tile numbers only."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any, Literal, overload
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ifo_grounding.data.codec import FrameCodec
+from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.truth import Truth
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.seeding import derive, generator
+from ifo_grounding.tasks import expert
+from ifo_grounding.tasks.goals import MAX_STEPS
+from ifo_grounding.tasks.grammar import grammar
+from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
+from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.world import Layout, step
+from ifo_grounding.world.tiles import TILE_SIZES, tile_index, tile_table
+
+BATCH = 4096
+
+
+@overload
+def record_demonstrations(
+    task: str, n: int, *, keep_truth: Literal[False] = ..., **options: Any
+) -> Demonstrations: ...
+@overload
+def record_demonstrations(
+    task: str, n: int, *, keep_truth: Literal[True], **options: Any
+) -> tuple[Demonstrations, Truth]: ...
+def record_demonstrations(  # type: ignore[misc]  # the overloads leave options open
+    task: str,
+    n: int,
+    *,
+    keep_truth: bool = False,
+    seed: int = 0,
+    split: str = "all",
+    holdout: str = "pairs-3",
+    holdout_visible: bool = True,
+    stream: str = "training",
+    layout: Layout | None = None,
+    max_steps: int = MAX_STEPS,
+    tile_size: int = 8,
+    progress: bool = False,
+) -> Demonstrations | tuple[Demonstrations, Truth]:
+    """Record an expert that follows suitable instructions on shortest paths, and then stops.
+
+    The scenes are none of those that an environment of the same seed shows.
+
+    Args:
+        task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
+        n: number of demonstrations.
+        keep_truth: whether to return actions and goals too, for evaluation only.
+        seed: same seed, same demonstrations.
+        split: ``all``, ``train`` or ``zero-shot`` instructions.
+        holdout: named list of colour-shape pairs that the split ``train`` does not mention.
+        holdout_visible: whether these pairs are still seen in scenes of the split ``train``.
+        stream: ``training``, ``validation`` or ``evaluation`` scenes.
+        layout: grid size and numbers of things.
+        max_steps: actions per episode.
+        tile_size: pixels along one side of a cell: 8, 16 or 32.
+        progress: whether to show a bar.
+
+    Returns:
+        The demonstrations; with ``keep_truth`` also a :class:`~ifo_grounding.data.truth.Truth`.
+
+    Raises:
+        UserError: on an unknown name or an impossible size.
+
+    >>> demos = record_demonstrations("pick-out", 20, seed=0)
+    >>> demos
+    Demonstrations(20 episodes, ... frames, FrameCodec(3x48x48, ... tiles of 8))
+    """
+    check_choice("tile size", tile_size, TILE_SIZES)
+    if n < 1:
+        raise UserError(f"the number of demonstrations must be at least 1, got {n}")
+    options = SceneOptions(
+        task=task,
+        split=split,
+        holdout=holdout,
+        holdout_visible=holdout_visible,
+        stream=stream,
+        layout=layout or Layout(),
+        max_steps=max_steps,
+    )
+    parts: list[Tensor] = []
+    lengths, instructions, actions = [], [], []
+    with _one_thread(), tqdm(total=n, desc="record", disable=not progress) as bar:
+        for first in range(0, n, BATCH):
+            scenes, frames, taken = _record_batch(options, seed, first, min(n, first + BATCH))
+            parts.append(frames)
+            actions.append(taken)
+            lengths.append(scenes.wanted.steps + 1)
+            instructions.append(scenes.instruction.to(torch.int16))
+            bar.update(len(scenes))
+    numbering = generator(seed, "demonstrations", "tile numbers")
+    codec, codes = FrameCodec.from_tiles(tile_table(tile_size), parts, numbering)
+    tokens = torch.cat(instructions)
+    demos = Demonstrations(codec, codes, torch.cat(lengths), tokens, vocabulary=VOCABULARY)
+    if not keep_truth:
+        return demos
+    return demos, Truth(torch.cat(actions), grammar(task).parse_tokens(tokens.long()))
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch run on one thread: for steps this small, threads wait more than they work."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _record_batch(
+    options: SceneOptions, seed: int, first: int, end: int
+) -> tuple[Scene, Tensor, Tensor]:
+    # A stream keeps the scenes that it drew: a new one for each batch frees them.
+    stream = SceneStream(options, derive(seed, "demonstrations"))
+    scenes = stream.scenes(torch.arange(first, end))
+    ties = generator(seed, "demonstrations", options.stream, "ties", first)
+    return scenes, *_demonstrate(scenes, ties)
+
+
+def _demonstrate(scenes: Scene, ties: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Follow the instructions of all scenes side by side.
+
+    Returns:
+        Tile numbers of the frames of all episodes in a row, int16 [F, rows, columns], and the
+        actions of all episodes in a row, uint8 [F - episodes].
+    """
+    steps = scenes.wanted.steps
+    frame_ends = (steps + 1).cumsum(0)
+    action_ends = steps.cumsum(0)
+    # Longest first, so that running episodes are always the first rows.
+    steps, order = steps.sort(descending=True, stable=True)
+    first_frame = (frame_ends - 1)[order] - steps
+    first_action = action_ends[order] - steps
+    wanted, state = scenes.wanted[order], scenes.state[order]
+
+    side = state.size
+    frames = torch.empty(int(frame_ends[-1]), side, side, dtype=torch.int16)
+    actions = torch.empty(int(action_ends[-1]), dtype=torch.uint8)
+    for time in range(int(steps[0]) + 1):
+        present = int((steps >= time).sum())
+        frames[first_frame[:present] + time] = tile_index(state[:present]).to(torch.int16)
+        acting = int((steps > time).sum())
+        if not acting:
+            break
+        wanted, state = wanted[:acting], state[:acting]
+        action = expert.act(state, wanted, ties)
+        actions[first_action[:acting] + time] = action.to(torch.uint8)
+        state = step(state, action)
+    return frames, actions

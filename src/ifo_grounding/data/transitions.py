@@ -1,0 +1,267 @@
+"""The learner's own experience: transitions of random actions, for the inverse model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import Categorical, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from ifo_grounding import keys
+from ifo_grounding.data.codec import FrameCodec
+from ifo_grounding.data.decoding import FrameDecoder
+from ifo_grounding.data.folder import fact, load_folder, save_folder
+from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import generator as seeded
+
+KIND = "ifo-grounding transitions"
+VERSION = 1
+BATCH_FRAMES = 2048
+READ_KEYS = (keys.PIXELS, keys.ACTION, (keys.NEXT, keys.PIXELS))
+KIND = "ifo-grounding transitions"
+VERSION = 1
+ARRAYS = ("pixels", "next_pixels", "actions", "taken", "kept")
+
+
+class RandomActions(TensorDictModuleBase):
+    """A policy that draws actions with fixed probabilities, by its own generator.
+
+    Args:
+        env: environment with one categorical action.
+        stop_probability: probability of ``stop_action``; the others share the rest evenly. By
+            default all are equally likely.
+        stop_action: by default the last action.
+        seed: of the actions.
+
+    Raises:
+        UserError: where the actions are not categorical, or the stop is not one of them.
+
+    >>> from ifo_grounding.envs import PickAndPlaceEnv
+    >>> env = PickAndPlaceEnv("move", num_envs=3, seed=0)
+    >>> RandomActions(env)(env.reset())["action"].shape
+    torch.Size([3])
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        stop_probability: float | None = None,
+        stop_action: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        spec = env.action_spec
+        if not isinstance(spec, Categorical) or spec.shape != env.batch_size:
+            raise UserError(f"random transitions need one categorical action, got {spec}")
+        self.in_keys: list[Any] = []
+        self.out_keys = [env.action_key]
+        self.shape, self.n_actions, self.device = spec.shape, int(spec.space.n), env.device
+        self.stop_action = self.n_actions - 1 if stop_action is None else stop_action
+        if not 0 <= self.stop_action < self.n_actions:
+            raise UserError(f"stop_action must be 0..{self.n_actions - 1}, got {stop_action}")
+        self.probabilities = torch.full((self.n_actions,), 1 / self.n_actions)
+        if stop_probability is not None:
+            if not 0.0 <= stop_probability <= 1.0 or self.n_actions < 2:
+                raise UserError(f"stop_probability must be within 0..1, got {stop_probability}")
+            self.probabilities.fill_((1 - stop_probability) / (self.n_actions - 1))
+            self.probabilities[self.stop_action] = stop_probability
+        self.generator = seeded(seed, "random actions")
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write an action into each row."""
+        n = self.shape.numel()
+        drawn = self.probabilities.multinomial(n, replacement=True, generator=self.generator)
+        return tensordict.set(self.out_keys[0], drawn.view(self.shape).to(self.device))
+
+
+@dataclass(frozen=True)
+class TransitionReport:
+    """How many steps of each action were taken, and how many of them are in the buffer."""
+
+    taken: Tensor
+    """Steps taken with each action, int64 [A]."""
+    kept: Tensor
+    """Of these, steps in the buffer, int64 [A]."""
+
+    def __str__(self) -> str:
+        rows = zip(self.taken.tolist(), self.kept.tolist(), strict=True)
+        lines = [f"{action:<7}{taken:>9}{kept:>9}" for action, (taken, kept) in enumerate(rows)]
+        return "\n".join(["action     taken     kept", *lines])
+
+
+class Collected(NamedTuple):
+    """Random transitions in a replay buffer, and their counts."""
+
+    buffer: TensorDictReplayBuffer
+    """Samples hold ``pixels``, ``action`` and ``("next", "pixels")``."""
+    report: TransitionReport
+    """Counts per action."""
+
+    def save(self, folder: str | Path) -> None:
+        """Write a folder of ``.npy`` files and ``meta.json``."""
+        stored = self.buffer.storage.get(slice(0, len(self.buffer)))
+        codec = next(part for part in self.buffer.transform if isinstance(part, FrameDecoder)).codec
+        arrays = {
+            "pixels": stored[keys.PIXELS],
+            "next_pixels": stored[keys.NEXT, keys.PIXELS],
+            "action": stored[keys.ACTION],
+            "taken": self.report.taken,
+            "kept": self.report.kept,
+        }
+        if codec.tiles is not None:
+            arrays["tiles"] = codec.tiles
+        save_folder(folder, KIND, VERSION, arrays, {"image_shape": list(codec.image_shape)})
+
+    @classmethod
+    def load(cls, folder: str | Path, **options: Any) -> Collected:
+        """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`.
+
+        Args:
+            folder: where from.
+            options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``generator``.
+        """
+        names = ("pixels", "next_pixels", "action", "taken", "kept")
+        arrays, facts = load_folder(folder, KIND, VERSION, names, ("tiles",))
+        codes, after, action = (arrays[name] for name in names[:3])
+        try:
+            codec = FrameCodec(fact(facts, "image_shape", list), arrays.get("tiles"))
+        except (ValueError, TypeError) as error:
+            raise UserError(f"{folder} is damaged: {error}") from None
+        count = len(codec.tiles) if codec.tiles is not None else 256
+        for part in (codes, after):
+            if part.shape != (len(action), *codec.code_shape):
+                raise UserError(f"{folder} is damaged: its arrays do not fit each other")
+            if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < count:
+                raise UserError(f"{folder} is damaged: it holds a tile outside its dictionary")
+        if not len(action) or not 0 <= int(action.min()) <= int(action.max()) < len(
+            arrays["taken"]
+        ):
+            raise UserError(f"{folder} is damaged: it holds no actions, or unknown ones")
+        report = TransitionReport(arrays["taken"], arrays["kept"])
+        return cls(_buffer(codec, codes, action, after, options), report)
+
+
+def _buffer(
+    codec: FrameCodec, codes: Tensor, action: Tensor, after: Tensor, options: dict[str, Any]
+) -> TensorDictReplayBuffer:
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(action)), **options)
+    entries = {keys.PIXELS: codes, keys.ACTION: action, keys.NEXT: {keys.PIXELS: after}}
+    buffer.extend(TensorDict(entries, [len(action)]))
+    # Appended last, for what was stored so far is encoded already.
+    buffer.append_transform(FrameDecoder(codec))
+    return buffer
+
+
+def collect_transitions(
+    env: EnvBase,
+    n: int,
+    *,
+    stop_probability: float | None = None,
+    stop_action: int | None = None,
+    drop_unchanged: bool = True,
+    seed: int = 0,
+    progress: bool = False,
+    **options: Any,
+) -> Collected:
+    """Take ``n`` random steps and keep what they showed (paper, "Inverse model").
+
+    An unchanged frame may be a stop, a bump into a wall or a void pick or place: no model can tell.
+    With ``drop_unchanged`` such transitions are left out, other than stops; the model then calls an
+    unchanged frame a stop, which is right for demonstrators that waste no step. Uniform actions
+    stop after six steps on average, so that places are rare: a lower ``stop_probability`` helps.
+
+    Args:
+        env: environment with uint8 ``pixels`` and a categorical action; it is left open.
+        n: steps to take, at least; all environments of the batch step together. The buffer holds
+            fewer where unchanged ones are dropped.
+        stop_probability: probability of the stop; by default all actions are equally likely.
+        stop_action: which action is the stop; by default the last one.
+        drop_unchanged: whether to leave out unchanged transitions other than stops.
+        seed: of the actions; scenes are drawn by the environment.
+        progress: whether to show a bar.
+        options: for ``TensorDictReplayBuffer``, such as ``batch_size``, ``sampler``, ``generator``.
+
+    Returns:
+        The buffer, which stores codes and decodes them when sampled, and counts per action.
+
+    >>> from ifo_grounding.envs import PickAndPlaceEnv
+    >>> buffer, report = collect_transitions(PickAndPlaceEnv("pick", num_envs=8, seed=0), 64)
+    >>> int(report.taken.sum()), len(buffer) == int(report.kept.sum())
+    (64, True)
+    """
+    if n < 1:
+        raise UserError(f"n must be at least 1 step, got {n}")
+    policy = RandomActions(env, stop_probability, stop_action, seed)
+    harvest = _Harvest(policy.n_actions, policy.stop_action if drop_unchanged else None)
+    batches = _collect(env, policy, n, progress)
+    codec, codes = FrameCodec.compress(harvest.pieces(batches))
+    if not len(codes):
+        raise UserError(f"none of {n} steps changed anything or stopped: take more steps")
+    buffer = _buffer(codec, codes[0::2], torch.cat(harvest.actions), codes[1::2], options)
+    return Collected(buffer, TransitionReport(harvest.taken, harvest.kept))
+
+
+@dataclass
+class _Harvest:
+    """Takes frames and actions from collected batches, and counts."""
+
+    n_actions: int
+    stop_action: int | None
+    """The action whose unchanged transitions are kept; None keeps those of all."""
+    actions: list[Tensor] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.taken = torch.zeros(self.n_actions, dtype=torch.int64)
+        self.kept = torch.zeros(self.n_actions, dtype=torch.int64)
+
+    def pieces(self, batches: Iterator[TensorDictBase]) -> Iterator[Tensor]:
+        """Yield frames and next frames in turns, uint8 [2 K, C, H, W], of the K kept steps."""
+        for batch in batches:
+            action = batch[keys.ACTION].cpu()
+            pixels, after = batch[keys.PIXELS].cpu(), batch[keys.NEXT, keys.PIXELS].cpu()
+            self.taken += action.bincount(minlength=self.n_actions)
+            if self.stop_action is not None:
+                changed = (pixels != after).flatten(1).any(1)
+                keep = changed | (action == self.stop_action)
+                action, pixels, after = action[keep], pixels[keep], after[keep]
+            self.kept += action.bincount(minlength=self.n_actions)
+            self.actions.append(action)
+            yield torch.stack([pixels, after], 1).flatten(0, 1)
+
+
+def _collect(
+    env: EnvBase, policy: RandomActions, n: int, progress: bool
+) -> Iterator[TensorDictBase]:
+    """Yield flat batches of steps, ``n`` in all."""
+    width = max(1, env.batch_size.numel())
+    frames = width * max(1, min(BATCH_FRAMES, n) // width)
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=frames,
+        # Without an end of its own: at the end it would close the environment.
+        total_frames=-1,
+        split_trajs=False,
+        compact_obs=False,
+        auto_register_policy_transforms=False,
+    )
+    remaining = n
+    try:
+        with tqdm(total=n, desc="collect", disable=not progress) as bar:
+            for batch in collector:
+                yield batch.select(*READ_KEYS).reshape(-1)[:remaining]
+                bar.update(min(frames, remaining))
+                remaining -= min(frames, remaining)
+                if not remaining:
+                    return
+    finally:
+        collector.shutdown(close_env=False)

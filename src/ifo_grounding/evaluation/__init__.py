@@ -1,0 +1,58 @@
+"""Measuring what was learned, each number with its interval.
+
+Evaluation reads the truth (scenes, goals, rewards); learners never import it.
+"""
+
+from ifo_grounding.evaluation.episodes import evaluating
+from ifo_grounding.evaluation.labels import LabelAccuracy, label_accuracy
+from ifo_grounding.evaluation.recording import Episode, record_episodes
+from ifo_grounding.evaluation.reward import (
+    ReturnAudit,
+    RewardAudit,
+    return_correlation,
+    reward_audit,
+)
+from ifo_grounding.evaluation.success import SuccessResult, compare_success, success_rate
+from ifo_grounding.evaluation.suitability import (
+    SuitabilityResult,
+    judged_choices,
+    suitable_rate,
+)
+from ifo_grounding.stats import (
+    Difference,
+    Estimate,
+    Rate,
+    auc,
+    correlation,
+    holm,
+    paired_difference,
+    two_level_bootstrap,
+    wilson,
+)
+
+__all__ = [
+    "Difference",
+    "Episode",
+    "Estimate",
+    "LabelAccuracy",
+    "Rate",
+    "ReturnAudit",
+    "RewardAudit",
+    "SuccessResult",
+    "SuitabilityResult",
+    "auc",
+    "compare_success",
+    "correlation",
+    "evaluating",
+    "holm",
+    "judged_choices",
+    "label_accuracy",
+    "paired_difference",
+    "record_episodes",
+    "return_correlation",
+    "reward_audit",
+    "success_rate",
+    "suitable_rate",
+    "two_level_bootstrap",
+    "wilson",
+]

@@ -1,0 +1,229 @@
+"""Playing one episode per fixed scene."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
+
+from ifo_grounding import keys
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.seeding import derive
+
+MAX_STEPS = 40
+MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
+"""How actions are chosen: the likeliest, or drawn from the policy's distribution."""
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+"""Anything that writes an action into a tensordict, a TensorDictModule mostly."""
+OnStep = Callable[[Tensor, TensorDictBase], None]
+"""Told, after each step, the rows still running, int64 [R], and their transitions, [R]."""
+
+
+class Outcomes(NamedTuple):
+    """How episodes ended."""
+
+    success: Tensor
+    """Whether the instruction was fulfilled at the end, bool [N]."""
+    lengths: Tensor
+    """Actions taken, the stop included, int64 [N]."""
+    stopped: Tensor
+    """Whether the policy stopped by itself, bool [N]."""
+
+
+@contextlib.contextmanager
+def evaluating(*modules: object) -> Iterator[None]:
+    """Run a block without gradients and in eval mode; every submodule gets its own mode back.
+
+    What is no ``nn.Module`` is left alone.
+
+    >>> network = nn.Sequential(nn.Dropout(), nn.Linear(1, 1).eval())
+    >>> with evaluating(network):
+    ...     print([part.training for part in network])
+    [False, False]
+    >>> [part.training for part in network]
+    [True, False]
+    """
+    parts = [part for m in modules if isinstance(m, nn.Module) for part in m.modules()]
+    in_training = [part for part in parts if part.training]
+    try:
+        for part in in_training:
+            part.training = False
+        with torch.no_grad():
+            yield
+    finally:
+        for part in in_training:
+            part.training = True
+
+
+def device_of(module: object) -> torch.device:
+    """Return the device of a module's first parameter or buffer, else the CPU."""
+    if isinstance(module, nn.Module):
+        for tensor in (*module.parameters(), *module.buffers()):
+            return tensor.device
+    return torch.device("cpu")
+
+
+@contextlib.contextmanager
+def seeded(seed: int, device: torch.device) -> Iterator[None]:
+    """Seed torch's global generators within a block and restore them after it."""
+    cuda = [device] if device.type == "cuda" else []
+    with torch.random.fork_rng(devices=cuda):
+        torch.manual_seed(seed)
+        yield
+
+
+def play(
+    policy: Policy,
+    env: EnvBase,
+    start: TensorDictBase,
+    *,
+    mode: str = "greedy",
+    max_steps: int = MAX_STEPS,
+    on_step: OnStep | None = None,
+) -> Outcomes:
+    """Play every row's episode to its end, once.
+
+    The policy is asked for the rows still running only. What rows do after their episode is
+    ignored; an episode that has not ended after ``max_steps`` counts as a failure.
+
+    Args:
+        policy: writes an action; put it into eval mode yourself (:func:`evaluating`).
+        env: a batched environment, just reset.
+        start: what its reset returned.
+        mode: ``greedy`` or ``sampled``.
+        max_steps: most actions per episode.
+        on_step: called after each step with the rows that took it and their transitions.
+
+    Returns:
+        Outcomes of all rows [N], N the number of rows of the env.
+    """
+    check_choice("mode", mode, MODES)
+    rows = env.batch_size.numel()
+    on = {"device": start.device or env.device}
+    success = torch.zeros(rows, dtype=torch.bool, **on)
+    lengths = torch.zeros(rows, dtype=torch.int64, **on)
+    stopped = torch.zeros(rows, dtype=torch.bool, **on)
+    active = torch.arange(rows, **on)
+    state = start
+    # The world goes on after a stop, which spares new scenes for rows that nobody looks at.
+    runs_on = isinstance(env, PickAndPlaceEnv)
+    with set_exploration_type(MODES[mode]):
+        for _ in range(max_steps):
+            state[env.action_key] = _actions(policy, env, state, active)
+            stepped = env.step(state)
+            transition = stepped.reshape(rows)[active]
+            after = transition[keys.NEXT]
+            ended = after["done"].reshape(-1)
+            lengths[active] += 1
+            success[active] = ended & (after[env.reward_key].reshape(-1) > 0)
+            by_itself = after.get("terminated", after["done"])
+            stopped[active] = ended & by_itself.reshape(-1)
+            if on_step is not None:
+                on_step(active, transition)
+            active = active[~ended]
+            if not len(active):
+                break
+            state = env.step_mdp(stepped)
+            if not runs_on:
+                state = env.maybe_reset(state)
+    return Outcomes(success, lengths, stopped)
+
+
+def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor) -> Tensor:
+    """Actions for all rows, of which only the active ones were asked of the policy."""
+    if isinstance(policy, RandomPolicy):  # draws for the whole batch of its spec
+        return policy(state)[env.action_key]
+    every = env.action_spec.zero()
+    shape = (env.batch_size.numel(), *every.shape[len(env.batch_size) :])
+    action = every.reshape(shape).clone()
+    chosen = policy(state.reshape(shape[0])[active])[env.action_key]
+    action[active] = chosen.to(action)
+    return action.reshape(every.shape)
+
+
+class SceneHash:
+    """Hash of the first frames and instructions of scenes, whatever batches they come in."""
+
+    def __init__(self) -> None:
+        self._pixels, self._instructions = hashlib.blake2b(), hashlib.blake2b()
+
+    def update(self, start: TensorDictBase, scenes: int) -> None:
+        """Add the first ``scenes`` rows of what a reset returned."""
+        flat = start.reshape(start.batch_size.numel())[:scenes]
+        self._pixels.update(flat[keys.PIXELS].cpu().contiguous().numpy().tobytes())
+        instructions = flat[keys.INSTRUCTION].cpu().contiguous().numpy()
+        self._instructions.update(instructions.astype("<i8").tobytes())
+
+    def hexdigest(self) -> str:
+        """Return 16 hexadecimal digits."""
+        both = self._pixels.digest() + self._instructions.digest()
+        return hashlib.blake2b(both, digest_size=8).hexdigest()
+
+
+def scene_batches(
+    env_or_task: EnvBase | str,
+    numbers: Sequence[int],
+    *,
+    seed: int,
+    stream: str,
+    batch_size: int,
+    device: torch.device,
+    **env_options: Any,
+) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
+    """Yield environments reset to the scenes with the given numbers, batch by batch.
+
+    Args:
+        env_or_task: name of a task, or an instructed environment to use as it is. An environment
+            is seeded anew before each batch, so that its scenes depend on ``seed`` and nothing
+            else; its scenes have no numbers, and ``numbers`` only counts them.
+        numbers: which scenes of the stream.
+        seed: of the stream.
+        stream: ``training``, ``validation`` or ``evaluation``.
+        batch_size: rows of an environment made here.
+        device: of an environment made here.
+        env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
+
+    Yields:
+        The environment, what its reset returned, and how many of its rows count.
+    """
+    if not isinstance(env_or_task, str):
+        yield from _batches_of(env_or_task, len(numbers), seed, stream, env_options)
+        return
+    rows = min(batch_size, len(numbers))
+    env = PickAndPlaceEnv(
+        env_or_task, num_envs=rows, device=device, seed=seed, stream=stream, **env_options
+    )
+    wanted = torch.as_tensor(numbers, device=device)
+    for chosen in wanted.split(rows):
+        # The last batch is filled up with copies of its first scene, which do not count.
+        padded = torch.cat([chosen, chosen[:1].expand(rows - len(chosen))])
+        scene = TensorDict({keys.SCENE: padded.unsqueeze(-1)}, batch_size=[rows], device=device)
+        yield env, env.reset(scene), len(chosen)
+
+
+def _batches_of(
+    env: EnvBase, count: int, seed: int, stream: str, env_options: dict[str, Any]
+) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
+    if env_options:
+        raise UserError(
+            f"options {sorted(env_options)} are for an environment made from a task's name: "
+            "give them to your environment"
+        )
+    if keys.INSTRUCTION not in env.observation_spec.keys(True, True):
+        raise UserError(
+            "success needs an instructed environment: make it with instructed=True, or pass the "
+            "name of a task"
+        )
+    rows = env.batch_size.numel()
+    for batch, first in enumerate(range(0, count, rows)):
+        env.set_seed(derive(seed, stream, batch) % 2**31)
+        yield env, env.reset(), min(rows, count - first)

@@ -1,0 +1,169 @@
+"""How often a policy fulfils its instruction (paper, Table 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.evaluation.episodes import (
+    MAX_STEPS,
+    MODES,
+    Policy,
+    SceneHash,
+    device_of,
+    evaluating,
+    play,
+    scene_batches,
+    seeded,
+)
+from ifo_grounding.seeding import derive
+from ifo_grounding.stats import Difference, Rate, paired_difference, wilson
+
+
+@dataclass(frozen=True)
+class SuccessResult:
+    """Success on fixed scenes, one episode each."""
+
+    rate: Rate
+    """Share of scenes whose instruction was fulfilled at the end, with Wilson's interval."""
+    stopped: Rate
+    """Share of episodes that the policy ended by itself; the others ran out of steps."""
+    outcomes: Tensor
+    """Success of each scene, bool [N], on the CPU."""
+    lengths: Tensor
+    """Actions in each episode, int64 [N], on the CPU."""
+    scenes: str
+    """Hash of the first frames and instructions of all scenes."""
+    mode: str
+    """``greedy`` or ``sampled``."""
+    sampled: SuccessResult | None = None
+    """The sampled policy's result on the same scenes, where ``both`` were asked for."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON, without the outcome of every scene."""
+        values = {
+            "rate": self.rate.as_dict(),
+            "stopped": self.stopped.as_dict(),
+            "mean_length": float(self.lengths.double().mean()),
+            "scenes": self.scenes,
+            "mode": self.mode,
+        }
+        return values if self.sampled is None else {**values, "sampled": self.sampled.as_dict()}
+
+    def __str__(self) -> str:
+        """Return the rate with its interval."""
+        return str(self.rate)
+
+
+def success_rate(
+    policy: Policy,
+    env_or_task: EnvBase | str,
+    *,
+    mode: str = "greedy",
+    episodes: int = 2000,
+    seed: int = 0,
+    stream: str = "evaluation",
+    batch_size: int = 1000,
+    device: torch.device | str | None = None,
+    max_steps: int = MAX_STEPS,
+    **env_options: Any,
+) -> SuccessResult:
+    """Measure how often a policy fulfils its instruction: one episode per fixed scene.
+
+    The same seed and stream give the same scenes, whatever the policy, the mode and the batch
+    size; :attr:`SuccessResult.scenes` is their hash. The policy runs in eval mode and without
+    gradients, and its modes are as before afterwards; so are torch's global generators.
+
+    Args:
+        policy: writes an action into a tensordict, a TensorDictModule mostly.
+        env_or_task: name of a task; or an instructed batched environment with a true reward,
+            which is seeded anew and used as it is.
+        mode: ``greedy`` (the headline), ``sampled``, or ``both``: greedy, with the sampled
+            policy's result as its :attr:`SuccessResult.sampled`.
+        episodes: number of scenes.
+        seed: of the scenes and, where sampled, of the actions.
+        stream: ``evaluation`` for results, ``validation`` for choices.
+        batch_size: episodes side by side, for a task's name.
+        device: where to run, for a task's name; the policy's by default.
+        max_steps: most actions per episode.
+        env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`, such as
+            ``tile_size`` and ``split``.
+
+    Raises:
+        UserError: on an unknown name, no episodes, or an environment without instructions.
+
+    >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
+    >>> result = success_rate(stop, "move", episodes=50)
+    >>> print(result.rate, result.lengths.max().item())
+    0.0% [0.0, 7.1] (n=50) 1
+    """
+    check_choice("mode", mode, [*MODES, "both"])
+    if episodes < 1 or batch_size < 1:
+        raise UserError(f"episodes and batch_size must be positive, got {episodes}, {batch_size}")
+    options = {"seed": seed, "stream": stream, "batch_size": batch_size, **env_options}
+    if isinstance(env_or_task, str):
+        options["max_steps"] = max_steps
+    options["device"] = torch.device(device) if device is not None else device_of(policy)
+
+    def measure(how: str) -> SuccessResult:
+        return _measure(
+            policy, scene_batches(env_or_task, range(episodes), **options), how, seed, max_steps
+        )
+
+    if mode == "both":
+        return replace(measure("greedy"), sampled=measure("sampled"))
+    return measure(mode)
+
+
+def _measure(
+    policy: Policy,
+    batches: Iterator[tuple[EnvBase, TensorDictBase, int]],
+    mode: str,
+    seed: int,
+    max_steps: int,
+) -> SuccessResult:
+    scenes, parts = SceneHash(), []
+    for number, (env, start, count) in enumerate(batches):
+        scenes.update(start, count)
+        device = start[keys.PIXELS].device
+        with evaluating(policy), seeded(derive(seed, "success", mode, number), device):
+            ended = play(policy, env, start, mode=mode, max_steps=max_steps)
+        parts.append([column[:count].cpu() for column in ended])
+    success, lengths, stopped = (torch.cat(column) for column in zip(*parts, strict=True))
+    return SuccessResult(
+        rate=wilson(int(success.sum()), len(success)),
+        stopped=wilson(int(stopped.sum()), len(success)),
+        outcomes=success,
+        lengths=lengths,
+        scenes=scenes.hexdigest(),
+        mode=mode,
+    )
+
+
+def compare_success(before: SuccessResult, after: SuccessResult, **options: Any) -> Difference:
+    """Return the paired difference of two results on the same scenes.
+
+    Args:
+        before: result of the first policy.
+        after: result of the second.
+        options: of :func:`~ifo_grounding.stats.paired_difference`.
+
+    Raises:
+        UserError: where the scenes or the modes differ.
+    """
+    if before.scenes != after.scenes or len(before.outcomes) != len(after.outcomes):
+        raise UserError(
+            f"the results are about different scenes ({len(before.outcomes)}, {before.scenes}; "
+            f"{len(after.outcomes)}, {after.scenes}): use the same seed, stream and options"
+        )
+    if before.mode != after.mode:
+        raise UserError(f"cannot compare a {before.mode} with a {after.mode} policy")
+    return paired_difference(before.outcomes.numpy(), after.outcomes.numpy(), **options)

@@ -1,0 +1,45 @@
+"""The networks: encoders, fusion, and six TensorDictModules built from specs."""
+
+from ifo_grounding.networks.building import Blueprint
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.encoders import (
+    ConvEncoder,
+    InstructionEncoder,
+    PatchEncoder,
+    distinct_rows,
+)
+from ifo_grounding.networks.fusion import GatedAttention, ResidualBlock, ResidualFiLM, pool_cells
+from ifo_grounding.networks.goal import make_goal_judge
+from ifo_grounding.networks.instruction import PairScorer, make_instruction_classifier
+from ifo_grounding.networks.inverse import InverseNetwork, make_inverse
+from ifo_grounding.networks.persistence import load, save
+from ifo_grounding.networks.policy import PolicyNetwork, ValueNetwork, make_policy, make_value
+from ifo_grounding.networks.reward import RewardNetwork, make_reward_model
+from ifo_grounding.networks.shapes import Shapes
+
+__all__ = [
+    "Blueprint",
+    "ConvEncoder",
+    "GatedAttention",
+    "InstructionEncoder",
+    "InverseNetwork",
+    "NetworkConfig",
+    "PairScorer",
+    "PatchEncoder",
+    "PolicyNetwork",
+    "ResidualBlock",
+    "ResidualFiLM",
+    "RewardNetwork",
+    "Shapes",
+    "ValueNetwork",
+    "distinct_rows",
+    "load",
+    "make_goal_judge",
+    "make_instruction_classifier",
+    "make_inverse",
+    "make_policy",
+    "make_reward_model",
+    "make_value",
+    "pool_cells",
+    "save",
+]

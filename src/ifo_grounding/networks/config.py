@@ -1,0 +1,99 @@
+"""Every size and choice of a network, in one dataclass, with the values of the two presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from ifo_grounding.errors import UserError, check_choice
+
+KINDS = ("inverse", "policy", "value", "instruction", "reward", "goal")
+"""The networks of this package."""
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes and choices of a network.
+
+    >>> NetworkConfig.of("policy", "paper", dropout=0.0).features
+    32
+    """
+
+    preset: str
+    """``"paper"`` (strided convolutions, gated attention) or ``"strong"`` (patches, FiLM)."""
+    features: int
+    """Channels of the feature map."""
+    conv_layers: int
+    """Strided convolutions (``paper``)."""
+    patch_size: int | None
+    """Pixels per side of a patch (``strong``); None means the tile size, or 8."""
+    n_blocks: int
+    """Residual blocks over the feature map (``strong``)."""
+    embedding: int
+    """Size of a word's embedding."""
+    hidden: int
+    """Size of the GRU's state, each way."""
+    dropout: float
+    """Dropout rate before each linear layer of the head."""
+    head_hidden: tuple[int, ...]
+    """Sizes of the head's hidden layers."""
+    precision: str = "auto"
+    """``"fp32"``, ``"bf16"``, or ``"auto"``: bf16 where the hardware computes in it."""
+
+    def __post_init__(self) -> None:
+        check_choice("preset", self.preset, PRESETS)
+        check_choice("precision", self.precision, ("auto", "fp32", "bf16"))
+        for name in ("features", "embedding", "hidden"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.patch_size is not None and self.patch_size < 1:
+            raise UserError(f"patch_size must be at least 1, got {self.patch_size}")
+        if not 0 <= self.dropout < 1:
+            raise UserError(f"dropout must lie in [0, 1), got {self.dropout}")
+        object.__setattr__(self, "head_hidden", tuple(self.head_hidden))
+
+    @classmethod
+    def of(cls, kind: str, preset: str = "strong", **overrides: Any) -> NetworkConfig:
+        """Return the configuration of ``kind`` under ``preset``, with some values replaced.
+
+        Raises:
+            UserError: for an unknown kind, preset or name of a value.
+        """
+        check_choice("kind of network", kind, KINDS)
+        check_choice("preset", preset, PRESETS)
+        names = [field.name for field in fields(cls) if field.name != "preset"]
+        for name in overrides:
+            check_choice("option of a network", name, names)
+        return cls(preset=preset, **{**PRESETS[preset][kind], **overrides})
+
+
+_PAPER: dict[str, Any] = {
+    "features": 32,
+    "conv_layers": 4,
+    "patch_size": None,
+    "n_blocks": 0,
+    "embedding": 8,
+    "hidden": 64,
+    "dropout": 0.25,
+    "head_hidden": (128, 64),
+}
+_STRONG: dict[str, Any] = {
+    "features": 64,
+    "conv_layers": 0,
+    "patch_size": None,
+    "n_blocks": 4,
+    "embedding": 32,
+    "hidden": 64,
+    "dropout": 0.0,
+    "head_hidden": (128,),
+}
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "paper": {**dict.fromkeys(KINDS, _PAPER), "value": {**_PAPER, "dropout": 0.0}},
+    "strong": {
+        **dict.fromkeys(KINDS, _STRONG),
+        "inverse": {**_STRONG, "features": 32, "n_blocks": 2},
+        "instruction": {**_STRONG, "n_blocks": 0},
+        "goal": {**_STRONG, "n_blocks": 1},
+    },
+}
+"""Values by preset and kind. A critic has no dropout: its targets would be noise."""

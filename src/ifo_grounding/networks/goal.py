@@ -1,0 +1,57 @@
+"""Whether an instruction is fulfilled: an extension, learned from demonstrations' last frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+
+from ifo_grounding import keys
+from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
+from ifo_grounding.networks.instruction import PairScorer
+
+
+def make_goal_judge(
+    spec_source: Any,
+    preset: str = "strong",
+    *,
+    in_keys: Sequence[NestedKey] = (keys.INITIAL_PIXELS, keys.PIXELS, keys.INSTRUCTION),
+    out_key: NestedKey = keys.GOAL_SCORE,
+    device: torch.device | str | None = None,
+    seed: int | None = None,
+    **overrides: Any,
+) -> TensorDictModule:
+    """Build the goal judge: first image, image and instruction to a logit of success [*B, 1].
+
+    An extension of the paper, which assumes that demonstrations end in success. ``encode_pixels``
+    (of both images), ``encode_instruction``, ``score`` and ``score_all`` work as those of the
+    instruction module.
+
+    Args:
+        spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
+        preset: ``"strong"`` or ``"paper"``.
+        in_keys: the episode's first image and the present one, uint8 [*B, C, H, W], and the
+            instruction, int64 [*B, L].
+        out_key: where the logit goes.
+        device: where to build it.
+        seed: makes the initial weights a function of the seed alone.
+        overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
+
+    Raises:
+        UserError: for an unknown preset or option, or sizes that cannot be read.
+
+    >>> from ifo_grounding.networks import Shapes
+    >>> judge = make_goal_judge(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
+    >>> frame = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
+    >>> judge(initial_pixels=frame, pixels=frame, instruction=torch.ones(2, 16)).shape
+    torch.Size([2, 1])
+    """
+    check_keys(in_keys, ("first image", "image", "instruction"))
+    options = {"in_keys": list(in_keys), "out_key": out_key}
+    plan = blueprint("goal", spec_source, preset, options, overrides)
+    network = construct(partial(PairScorer, images=2), plan, device, seed)
+    return wrap(network, plan, in_keys, [out_key])

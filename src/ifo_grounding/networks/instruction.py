@@ -1,0 +1,154 @@
+"""Which instruction suits a scene (the paper's instruction module)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from ifo_grounding import keys
+from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.encoders import InstructionEncoder
+from ifo_grounding.networks.fusion import GatedAttention, ResidualBlock, ResidualFiLM, pool_cells
+from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.transfer import copy_weights, trunk_of
+from ifo_grounding.networks.trunk import (
+    Network,
+    encode_instruction,
+    flatten_cells,
+    grid,
+    head,
+    image_encoder,
+    same_batch,
+)
+
+
+class PairScorer(Network):
+    """Scores how images and an instruction go together, in two halves.
+
+    Images are encoded without the instruction and instructions without the images, so that N
+    scenes against P instructions cost N + P encodings and N x P light scores. ``strong`` scores by
+    one residual FiLM block and the maximum and mean over cells; ``paper`` by gated attention.
+    """
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
+        super().__init__(shapes, config)
+        self.images = images
+        self.image = image_encoder(shapes, config, images)
+        self.blocks = nn.Sequential(
+            *(ResidualBlock(config.features) for _ in range(config.n_blocks))
+        )
+        self.instruction = InstructionEncoder(
+            shapes.vocabulary_size, config.embedding, config.hidden
+        )
+        self.strong = config.preset == "strong"
+        fusion = ResidualFiLM if self.strong else GatedAttention
+        self.fusion = fusion(self.instruction.size, config.features)
+        size = config.features * (2 if self.strong else math.prod(grid(shapes, config)))
+        self.head = head(size, config, 1)
+
+    def encode_pixels(self, *pixels: Tensor) -> Tensor:
+        """Map images, each [*B, C, H, W], to features [*B, F, h, w] that know no instruction."""
+        flat = [self.flat_pixels(image) for image in pixels]
+        same_batch(**{f"image {number}": batch for number, (_, batch) in enumerate(flat)})
+        with self.autocast(pixels[0]):
+            features = F.relu(self.image(torch.cat([image for image, _ in flat], -3)))
+            features = self.blocks(features)
+        return features.reshape(*flat[0][1], *features.shape[1:])
+
+    def encode_instruction(self, instruction: Tensor) -> Tensor:
+        """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
+        return encode_instruction(self.instruction, instruction)
+
+    def score(self, features: Tensor, instruction: Tensor) -> Tensor:
+        """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""
+        batch = features.shape[:-3]
+        same_batch(features=batch, instruction=instruction.shape[:-1])
+        with self.autocast(features):
+            cells = features.movedim(-3, -1)
+            flat = cells.reshape(-1, *cells.shape[-3:]).contiguous().movedim(-1, -3)
+            fused = F.relu(self.fusion(flat, instruction.reshape(-1, instruction.shape[-1])))
+            outputs = self.head(pool_cells(fused) if self.strong else flatten_cells(fused))
+        return outputs.float().reshape(*batch, 1)
+
+    def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:
+        """Score every scene [N, F, h, w] with every instruction [P, D]: logits [N, P].
+
+        ``chunk`` bounds the pairs scored at once, so that they stay in the processor's cache.
+        """
+        scenes, pool = len(features), len(instruction)
+        pairs = torch.arange(scenes * pool, device=features.device)
+        cells = features.movedim(-3, -1).contiguous()
+        parts = [
+            self.score(
+                cells.index_select(0, part // pool).movedim(-1, -3), instruction[part % pool]
+            )
+            for part in pairs.split(chunk)
+        ]
+        return torch.cat(parts).reshape(scenes, pool) if parts else features.new_zeros(scenes, pool)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Score images, each [*B, C, H, W], with token ids [*B, L], the last input."""
+        *pixels, instruction = inputs
+        return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))
+
+
+def make_instruction_classifier(
+    spec_source: Any,
+    preset: str = "strong",
+    *,
+    in_keys: Sequence[NestedKey] = (keys.PIXELS, keys.INSTRUCTION),
+    out_key: NestedKey = keys.SUITABILITY,
+    init_from: nn.Module | None = None,
+    device: torch.device | str | None = None,
+    seed: int | None = None,
+    **overrides: Any,
+) -> TensorDictModule:
+    """Build the instruction module: an image and an instruction to a logit of suitability [*B, 1].
+
+    ``encode_pixels``, ``encode_instruction``, ``score`` and ``score_all`` of the result score many
+    instructions per image cheaply.
+
+    Args:
+        spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
+        preset: ``"strong"`` or ``"paper"``.
+        in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
+        out_key: where the logit goes; the paper's threshold of 0.8 is on its sigmoid.
+        init_from: a policy of the same preset and sizes whose encoders and first fusion are copied.
+            It has learned what the words look like, which first frames alone teach slowly (an
+            extension of the paper).
+        device: where to build it.
+        seed: makes the initial weights a function of the seed alone.
+        overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
+
+    Raises:
+        UserError: for an unknown preset or option, sizes that cannot be read, or a policy that
+            does not fit.
+
+    >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    >>> classifier = make_instruction_classifier(shapes, seed=0)
+    >>> scenes = classifier.encode_pixels(torch.zeros(5, 3, 48, 48, dtype=torch.uint8))
+    >>> pool = classifier.encode_instruction(torch.randint(40, (7, 16)))
+    >>> classifier.score_all(scenes, pool).shape
+    torch.Size([5, 7])
+    """
+    check_keys(in_keys, ("image", "instruction"))
+    options = {"in_keys": list(in_keys), "out_key": out_key}
+    plan = blueprint("instruction", spec_source, preset, options, overrides)
+    network = construct(PairScorer, plan, device, seed)
+    if init_from is not None:
+        trunk = trunk_of(init_from)
+        parts = [
+            (trunk.image, network.image),
+            (trunk.instruction, network.instruction),
+            (trunk.fusion[0], network.fusion),
+        ]
+        copy_weights(parts, init_from, plan)
+    return wrap(network, plan, in_keys, [out_key])

@@ -1,0 +1,94 @@
+"""Which action led from one image to the next (the paper's inverse module)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from ifo_grounding import keys
+from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.fusion import ResidualBlock, pool_cells
+from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.trunk import (
+    Network,
+    flatten_cells,
+    grid,
+    head,
+    image_encoder,
+    same_batch,
+)
+
+
+class InverseNetwork(Network):
+    """inv(s, s') -> logits of the actions.
+
+    ``strong`` also sees how far each pixel changed, which makes a stop plain, and pools over cells,
+    for what changes tells the action wherever it happens. ``paper`` sees the two images alone.
+    """
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
+        super().__init__(shapes, config)
+        self.strong = config.preset == "strong"
+        self.image = image_encoder(shapes, config, images=3 if self.strong else 2)
+        self.blocks = nn.Sequential(
+            *(ResidualBlock(config.features) for _ in range(config.n_blocks))
+        )
+        size = config.features * (2 if self.strong else math.prod(grid(shapes, config)))
+        self.head = head(size, config, shapes.n_actions)
+
+    def forward(self, pixels: Tensor, next_pixels: Tensor) -> Tensor:
+        """Map two images, each [*B, C, H, W], to float32 logits [*B, A]."""
+        before, batch = self.flat_pixels(pixels)
+        after, next_batch = self.flat_pixels(next_pixels)
+        same_batch(pixels=batch, next_pixels=next_batch)
+        images = [before, after]
+        if self.strong:
+            images.append(torch.maximum(before, after) - torch.minimum(before, after))
+        with self.autocast(pixels):
+            features = F.relu(self.image(torch.cat(images, -3)))
+            features = F.relu(self.blocks(features))
+            outputs = self.head(pool_cells(features) if self.strong else flatten_cells(features))
+        return outputs.float().reshape(*batch, outputs.shape[-1])
+
+
+def make_inverse(
+    spec_source: Any,
+    preset: str = "strong",
+    *,
+    in_keys: Sequence[NestedKey] = (keys.PIXELS, (keys.NEXT, keys.PIXELS)),
+    out_key: NestedKey = keys.LOGITS,
+    device: torch.device | str | None = None,
+    seed: int | None = None,
+    **overrides: Any,
+) -> TensorDictModule:
+    """Build the inverse module: two images to logits of the actions, float32 [*B, A].
+
+    Args:
+        spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
+        preset: ``"strong"`` or ``"paper"``.
+        in_keys: the image before and the image after, uint8 [*B, C, H, W].
+        out_key: where the logits go.
+        device: where to build it.
+        seed: makes the initial weights a function of the seed alone.
+        overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
+
+    Raises:
+        UserError: for an unknown preset or option, or sizes that cannot be read.
+
+    >>> inverse = make_inverse(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
+    >>> frame = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
+    >>> inverse(pixels=frame, next_pixels=frame).shape
+    torch.Size([2, 6])
+    """
+    check_keys(in_keys, ("image", "next image"))
+    options = {"in_keys": list(in_keys), "out_key": out_key}
+    plan = blueprint("inverse", spec_source, preset, options, overrides)
+    return wrap(construct(InverseNetwork, plan, device, seed), plan, in_keys, [out_key])

@@ -1,0 +1,144 @@
+"""What to do (the paper's action policy), and how well it will go (a critic for GAE)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict.nn import InteractionType, TensorDictModule
+from tensordict.utils import NestedKey
+from torch import nn
+from torch.distributions import Categorical
+from torchrl.data import Categorical as CategoricalSpec
+from torchrl.modules import ProbabilisticActor, ValueOperator
+
+from ifo_grounding import keys
+from ifo_grounding.networks.building import blueprint, check_keys, construct
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.transfer import copy_weights, trunk_of
+from ifo_grounding.networks.trunk import InstructedNetwork
+
+INPUTS: tuple[NestedKey, NestedKey] = (keys.PIXELS, keys.INSTRUCTION)
+
+
+class PolicyNetwork(InstructedNetwork):
+    """phi(s, t) -> logits of the actions, float32 [*B, A]."""
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
+        super().__init__(shapes, config, shapes.n_actions)
+
+
+class ValueNetwork(InstructedNetwork):
+    """V(s, t), float32 [*B, 1]."""
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
+        super().__init__(shapes, config, 1)
+
+
+def make_policy(
+    spec_source: Any,
+    preset: str = "strong",
+    *,
+    in_keys: Sequence[NestedKey] = INPUTS,
+    action_key: NestedKey = keys.ACTION,
+    logits_key: NestedKey = keys.LOGITS,
+    deterministic: bool = False,
+    device: torch.device | str | None = None,
+    seed: int | None = None,
+    **overrides: Any,
+) -> ProbabilisticActor:
+    """Build the action policy: an image and an instruction to an action, int64 [*B].
+
+    It samples by default; ``set_exploration_type`` wins over that. It is built in eval mode, in
+    which to collect and to evaluate; the supervised losses switch to train mode while they compute.
+
+    Args:
+        spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
+        preset: ``"strong"`` or ``"paper"``.
+        in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
+        action_key: where the action goes; its log-probability goes beside it, as TorchRL names it.
+        logits_key: where the logits go, float32 [*B, A].
+        deterministic: take the likeliest action by default.
+        device: where to build it.
+        seed: makes the initial weights a function of the seed alone.
+        overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
+
+    Raises:
+        UserError: for an unknown preset or option, or sizes that cannot be read.
+
+    >>> from tensordict import TensorDict
+    >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
+    >>> step = policy(TensorDict({
+    ...     "pixels": torch.zeros(2, 3, 48, 48, dtype=torch.uint8),
+    ...     "instruction": torch.ones(2, 16, dtype=torch.int64),
+    ... }, [2]))
+    >>> step["action"].shape, step["action_log_prob"].shape
+    (torch.Size([2]), torch.Size([2]))
+    """
+    check_keys(in_keys, ("image", "instruction"))
+    options = {
+        "in_keys": list(in_keys),
+        "action_key": action_key,
+        "logits_key": logits_key,
+        "deterministic": deterministic,
+    }
+    plan = blueprint("policy", spec_source, preset, options, overrides)
+    network = construct(PolicyNetwork, plan, device, seed)
+    policy = ProbabilisticActor(
+        TensorDictModule(network, in_keys=list(in_keys), out_keys=[logits_key]),
+        in_keys={"logits": logits_key},
+        out_keys=[action_key],
+        spec=CategoricalSpec(plan.shapes.n_actions, device=device),
+        distribution_class=Categorical,
+        return_log_prob=True,
+        default_interaction_type=(
+            InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
+        ),
+    )
+    policy.network_config = plan
+    return policy.eval()
+
+
+def make_value(
+    spec_source: Any,
+    preset: str = "strong",
+    *,
+    init_from: nn.Module | None = None,
+    in_keys: Sequence[NestedKey] = INPUTS,
+    out_key: NestedKey = keys.STATE_VALUE,
+    device: torch.device | str | None = None,
+    seed: int | None = None,
+    **overrides: Any,
+) -> ValueOperator:
+    """Build a critic: an image and an instruction to a value, float32 [*B, 1].
+
+    Args:
+        spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
+        preset: ``"strong"`` or ``"paper"``, either without dropout.
+        init_from: a policy of the same preset and sizes whose trunk's weights are copied.
+        in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
+        out_key: where the value goes.
+        device: where to build it.
+        seed: makes the initial weights a function of the seed alone.
+        overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
+
+    Raises:
+        UserError: for an unknown preset or option, sizes that cannot be read, or a policy whose
+            trunk does not fit.
+
+    >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    >>> value = make_value(shapes, init_from=make_policy(shapes, seed=0), seed=0)
+    >>> value(pixels=torch.zeros(2, 3, 48, 48), instruction=torch.ones(2, 16)).shape
+    torch.Size([2, 1])
+    """
+    check_keys(in_keys, ("image", "instruction"))
+    options = {"in_keys": list(in_keys), "out_key": out_key}
+    plan = blueprint("value", spec_source, preset, options, overrides)
+    network = construct(ValueNetwork, plan, device, seed)
+    if init_from is not None:
+        copy_weights([(trunk_of(init_from), network.trunk)], init_from, plan)
+    value = ValueOperator(network, in_keys=list(in_keys), out_keys=[out_key])
+    value.network_config = plan
+    return value.eval()

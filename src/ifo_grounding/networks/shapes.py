@@ -1,0 +1,124 @@
+"""What a network has to know about the world it is built for: a handful of sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict.utils import NestedKey
+from torchrl.data import Unbounded
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Sizes of images, instructions and actions.
+
+    >>> Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    Shapes(image_shape=(3, 48, 48), vocabulary_size=40, instruction_length=16, \
+n_actions=6, tile_size=None)
+    """
+
+    image_shape: tuple[int, int, int]
+    """Channels, height and width of an image."""
+    vocabulary_size: int
+    """Number of token ids, the pad 0 included."""
+    instruction_length: int = keys.INSTRUCTION_LENGTH
+    """Tokens per instruction, padding included."""
+    n_actions: int = keys.N_ACTIONS
+    """Number of actions."""
+    tile_size: int | None = None
+    """Pixels per side of a cell, where the image has cells."""
+
+    def __post_init__(self) -> None:
+        if len(self.image_shape) != 3 or min(self.image_shape) < 1:
+            raise UserError(
+                f"image_shape must be (channels, height, width), got {self.image_shape}"
+            )
+        for name in ("vocabulary_size", "instruction_length", "n_actions"):
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
+                raise UserError(f"{name} must be a positive integer, got {getattr(self, name)!r}")
+
+    @classmethod
+    def of(
+        cls,
+        source: Any,
+        pixels: NestedKey = keys.PIXELS,
+        instruction: NestedKey = keys.INSTRUCTION,
+        action: NestedKey = keys.ACTION,
+    ) -> Shapes:
+        """Read the sizes from ``source``.
+
+        Args:
+            source: a :class:`Shapes`, a TorchRL env, or anything with the attributes
+                ``image_shape`` and ``vocabulary_size`` (a dataset). Attributes named as the fields
+                of this class win over an env's specs.
+            pixels: where an env's spec describes images.
+            instruction: where an env's spec describes instructions.
+            action: where an env's spec describes actions.
+
+        Raises:
+            UserError: where a size can be read from neither an attribute nor a spec.
+        """
+        if isinstance(source, cls):
+            return source
+        observations = getattr(source, "observation_spec", None)
+        found = {name: _attribute(source, name) for name in cls.__dataclass_fields__}
+        if observations is not None:
+            for name, value in _from_specs(source, observations, pixels, instruction, action):
+                found[name] = value if found[name] is None else found[name]
+        for name, hint in (("image_shape", pixels), ("vocabulary_size", instruction)):
+            if found[name] is None:
+                raise UserError(
+                    f"cannot read {name} from {type(source).__name__}: pass an env with "
+                    f"{hint!r} in its observation_spec, or a networks.Shapes"
+                )
+        found["image_shape"] = tuple(int(size) for size in found["image_shape"])
+        return cls(**{name: value for name, value in found.items() if value is not None})
+
+
+def _attribute(source: Any, name: str) -> Any:
+    """Return a plain attribute; a vector env that answers per worker must agree with itself."""
+    try:
+        value = getattr(source, name, None)
+        answers = list(value) if isinstance(value, (list, tuple)) else [value]
+    except Exception:  # a closed or remote env may fail in many ways; its specs then speak
+        return None
+    if name == "image_shape":
+        return tuple(answers) if len(answers) == 3 else None
+    answer = answers[0] if answers else None
+    same = all(other == answer for other in answers)
+    return answer if same and isinstance(answer, int) else None
+
+
+def _from_specs(
+    env: Any, observations: Any, pixels: NestedKey, instruction: NestedKey, action: NestedKey
+) -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    leaves = observations.keys(True, True)
+    if pixels in leaves:
+        found.append(("image_shape", tuple(observations[pixels].shape[-3:])))
+    if instruction in leaves:
+        spec = observations[instruction]
+        found.append(("instruction_length", int(spec.shape[-1])))
+        found.append(("vocabulary_size", _count(spec)))
+    actions = getattr(env, "full_action_spec", None)
+    if actions is not None and action in actions.keys(True, True):
+        found.append(("n_actions", _count(actions[action])))
+    return found
+
+
+def _count(spec: Any) -> int | None:
+    """Return how many values a discrete or bounded integer spec allows, None if unbounded."""
+    if hasattr(spec, "nvec"):
+        return int(spec.nvec.max())
+    space = getattr(spec, "space", None)
+    n = getattr(space, "n", None)
+    if n is not None:
+        return int(n)
+    high = getattr(space, "high", None)
+    if high is None or spec.dtype.is_floating_point or isinstance(spec, Unbounded):
+        return None
+    return int(high.max()) + 1

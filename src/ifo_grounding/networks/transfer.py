@@ -1,0 +1,49 @@
+"""Beginning a network with weights that another one has learned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import nn
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks.building import Blueprint
+from ifo_grounding.networks.trunk import InstructedNetwork, Trunk
+
+
+def trunk_of(policy: nn.Module) -> Trunk:
+    """Return the trunk of a policy that ``make_policy`` built.
+
+    >>> from ifo_grounding.networks import Shapes, make_policy
+    >>> trunk_of(make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))).size
+    2304
+    """
+    trunks = [part.trunk for part in policy.modules() if isinstance(part, InstructedNetwork)]
+    if len(trunks) != 1:
+        raise UserError("init_from must be a policy built by make_policy")
+    return trunks[0]
+
+
+def copy_weights(
+    parts: Sequence[tuple[nn.Module, nn.Module]], source: nn.Module, plan: Blueprint
+) -> None:
+    """Copy the weights of each pair's first module to its second.
+
+    Args:
+        parts: modules of the same kind and sizes.
+        source: the network that the first modules are from, for the error.
+        plan: what the network to begin was built from, for the error.
+
+    Raises:
+        UserError: where the weights do not fit.
+    """
+    try:
+        for given, taken in parts:
+            taken.load_state_dict(given.state_dict())
+    except RuntimeError:
+        origin: Blueprint | None = getattr(source, "network_config", None)
+        described = f"{origin.config} for {origin.shapes}" if origin else "another network"
+        raise UserError(
+            f"the trunk of init_from does not fit: it is {described}, this is {plan.config} for "
+            f"{plan.shapes}; give both the same preset, sizes and options"
+        ) from None

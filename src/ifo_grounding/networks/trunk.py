@@ -1,0 +1,161 @@
+"""What the networks share: flattening batches, precision, image encoders, heads, and the trunk."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+from collections.abc import Iterator
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.encoders import (
+    ConvEncoder,
+    InstructionEncoder,
+    PatchEncoder,
+)
+from ifo_grounding.networks.fusion import GatedAttention, ResidualFiLM
+from ifo_grounding.networks.shapes import Shapes
+
+
+@functools.cache
+def bf16_is_native(device_type: str) -> bool:
+    """Whether the hardware computes in bf16, rather than emulating it slowly."""
+    if device_type == "cpu":
+        return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    if device_type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return False
+
+
+@contextlib.contextmanager
+def autocast(device_type: str, precision: str) -> Iterator[None]:
+    """Compute in ``precision``; ``"auto"`` without native bf16 leaves the caller's choice."""
+    if precision == "auto" and not bf16_is_native(device_type):
+        yield
+        return
+    with torch.autocast(device_type, torch.bfloat16, enabled=precision != "fp32"):
+        yield
+
+
+class Network(nn.Module):
+    """Base of the networks: takes any leading batch dims, checks shapes, computes in precision."""
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
+        super().__init__()
+        self.shapes = shapes
+        self.config = config
+
+    def flat_pixels(self, pixels: Tensor) -> tuple[Tensor, torch.Size]:
+        """Return pixels [*B, C, H, W] as [N, C, H, W], and B.
+
+        Raises:
+            UserError: for an image of another size than this network was built for.
+        """
+        if tuple(pixels.shape[-3:]) != self.shapes.image_shape:
+            raise UserError(
+                f"this network was built for images of {self.shapes.image_shape}, got "
+                f"{tuple(pixels.shape[-3:])}: build another for this env or dataset"
+            )
+        return pixels.reshape(-1, *pixels.shape[-3:]), pixels.shape[:-3]
+
+    def autocast(self, tensor: Tensor) -> contextlib.AbstractContextManager[None]:
+        """Compute in the configured precision on the device of ``tensor``."""
+        return autocast(tensor.device.type, self.config.precision)
+
+
+def same_batch(**batches: torch.Size) -> None:
+    """Raise :class:`UserError` unless all inputs have the same leading dims."""
+    if len(set(batches.values())) > 1:
+        listed = ", ".join(f"{name} {list(batch)}" for name, batch in batches.items())
+        raise UserError(f"inputs must have the same batch dims, got {listed}: expand them first")
+
+
+def encode_instruction(encoder: InstructionEncoder, tokens: Tensor) -> Tensor:
+    """Encode tokens [*B, L] to [*B, D], in float32: a recurrence is too small to gain from bf16."""
+    with torch.autocast(tokens.device.type, enabled=False):
+        flat = encoder(tokens.reshape(-1, tokens.shape[-1]))
+    return flat.reshape(*tokens.shape[:-1], encoder.size)
+
+
+def image_encoder(shapes: Shapes, config: NetworkConfig, images: int = 1) -> nn.Module:
+    """Return the preset's encoder of ``images`` images laid on top of each other."""
+    channels = images * shapes.image_shape[0]
+    if config.preset == "paper":
+        return ConvEncoder(channels, config.features, config.conv_layers)
+    patch = patch_size(shapes, config)
+    return PatchEncoder(channels, config.features, patch, grid(shapes, config))
+
+
+def patch_size(shapes: Shapes, config: NetworkConfig) -> int:
+    """Return the side of a patch: as configured, or the side of a tile, or 8 pixels."""
+    return config.patch_size or shapes.tile_size or 8
+
+
+def grid(shapes: Shapes, config: NetworkConfig) -> tuple[int, int]:
+    """Return the height and width of the feature map."""
+    _, height, width = shapes.image_shape
+    if config.preset == "paper":
+        return ConvEncoder.grid(height, width, config.conv_layers)
+    return PatchEncoder.grid(height, width, patch_size(shapes, config))
+
+
+def flatten_cells(features: Tensor) -> Tensor:
+    """Flatten [N, F, h, w] to [N, h * w * F], the order in which it lies in memory."""
+    return features.permute(0, 2, 3, 1).flatten(1)
+
+
+def head(size: int, config: NetworkConfig, outputs: int) -> nn.Sequential:
+    """Return several linear layers with ReLU between them and dropout before each."""
+    layers: list[nn.Module] = []
+    for hidden in config.head_hidden:
+        layers += [nn.Dropout(config.dropout), nn.Linear(size, hidden), nn.ReLU()]
+        size = hidden
+    return nn.Sequential(*layers, nn.Dropout(config.dropout), nn.Linear(size, outputs))
+
+
+class Trunk(nn.Module):
+    """Features of an image in the light of an instruction, flattened so that places matter."""
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
+        super().__init__()
+        self.image = image_encoder(shapes, config)
+        self.instruction = InstructionEncoder(
+            shapes.vocabulary_size, config.embedding, config.hidden
+        )
+        size = self.instruction.size
+        self.fusion: nn.ModuleList = nn.ModuleList(
+            [GatedAttention(size, config.features)]
+            if config.preset == "paper"
+            else [ResidualFiLM(size, config.features) for _ in range(config.n_blocks)]
+        )
+        self.size = config.features * math.prod(grid(shapes, config))
+
+    def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
+        """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
+        instruction = encode_instruction(self.instruction, tokens)
+        features = self.image(image)
+        for fuse in self.fusion:
+            features = fuse(features, instruction)
+        return flatten_cells(F.relu(features))
+
+
+class InstructedNetwork(Network):
+    """The trunk and a head: what policy, critic and reward model are made of."""
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig, outputs: int) -> None:
+        super().__init__(shapes, config)
+        self.trunk = Trunk(shapes, config)
+        self.head = head(self.trunk.size, config, outputs)
+
+    def forward(self, pixels: Tensor, instruction: Tensor) -> Tensor:
+        """Map pixels [*B, C, H, W] and token ids [*B, L] to float32 [*B, outputs]."""
+        image, batch = self.flat_pixels(pixels)
+        same_batch(pixels=batch, instruction=instruction.shape[:-1])
+        with self.autocast(pixels):
+            outputs = self.head(self.trunk(image, instruction.reshape(-1, instruction.shape[-1])))
+        return outputs.float().reshape(*batch, outputs.shape[-1])

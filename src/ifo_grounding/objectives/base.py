@@ -1,0 +1,120 @@
+"""What the losses share: one network, its mode while the loss computes, and reductions."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives.common import LossModule
+
+from ifo_grounding.errors import UserError, check_choice
+
+
+@contextlib.contextmanager
+def mode(network: nn.Module, training: bool) -> Iterator[None]:
+    """Put every part of ``network`` into train or eval mode, and back into its own afterwards.
+
+    >>> network = nn.Sequential(nn.Dropout(), nn.Linear(1, 1)).eval()
+    >>> with mode(network, training=True):
+    ...     inside = network[0].training
+    >>> inside, network[0].training
+    (True, False)
+    """
+    before = {part: part.training for part in network.modules()}
+    network.train(training)
+    try:
+        yield
+    finally:
+        for part, was in before.items():
+            part.training = was
+
+
+class SupervisedLoss(LossModule):
+    """Base of the supervised losses of one network.
+
+    The network computes in the mode of the loss, whatever its own: with dropout after
+    ``loss.train()`` (as built), without after ``loss.eval()``. Afterwards each part of the network
+    is back in the mode it had, so a policy that collects in eval mode stays in it.
+
+    Args:
+        network: the network to train.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the losses of the samples. Metrics are
+            always means.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        action: NestedKey = "action"
+
+    default_keys: Any = _AcceptedKeys
+    tensor_keys: Any
+
+    def __init__(self, network: TensorDictModule, *, reduction: str = "mean") -> None:
+        super().__init__()
+        check_choice("reduction", reduction, ("mean", "sum", "none"))
+        self.network = network
+        self.reduction = reduction
+
+    @property
+    def functional(self) -> bool:
+        """The network is used as it is: nothing is copied or made stateless."""
+        return False
+
+    def _extra_keys(self) -> list[NestedKey]:
+        """Return the keys read besides the network's own."""
+        return [self.tensor_keys.action]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Every key that :meth:`forward` reads."""
+        own = list(self.network.in_keys)
+        return own + [key for key in self._extra_keys() if key not in own]
+
+    @in_keys.setter
+    def in_keys(self, values: object) -> None:
+        raise UserError("in_keys follow from the network and set_keys: use set_keys")
+
+    def _require(self, tensordict: TensorDictBase) -> None:
+        """Raise :class:`UserError` where a key is missing, for ``get`` would return None."""
+        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+        if missing:
+            raise UserError(
+                f"the batch lacks {missing}: {type(self).__name__} reads {self.in_keys}; set_keys "
+                "and the in_keys of the network change the names"
+            )
+
+    def _mode(self) -> contextlib.AbstractContextManager[None]:
+        return mode(self.network, self.training)
+
+    def _mean(self, values: Tensor, tensordict: TensorDictBase | None = None) -> Tensor:
+        """Return the mean of a metric over the samples that a mask of TorchRL leaves."""
+        return self._reduce_loss(values.detach().float(), tensordict, reduction="mean")
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        """No value estimator: nothing to forward."""
+
+
+def flat(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
+    """Return the entries at ``keys`` with one batch dim."""
+    chosen = tensordict.select(*keys)
+    return chosen.reshape(chosen.batch_size.numel()) if chosen.ndim else chosen.unsqueeze(0)
+
+
+def scalars(**values: Tensor) -> TensorDict:
+    """Return a tensordict without batch dims."""
+    return TensorDict(dict(values), [])
+
+
+def check_action(action: Tensor, expected: tuple[int, ...]) -> None:
+    """Raise :class:`UserError` unless ``action`` has the shape that the network acts in."""
+    if tuple(action.shape) != tuple(expected):
+        raise UserError(
+            f"actions must have shape {list(expected)}, got {list(action.shape)}: indices have no "
+            "trailing dim, and one-hot actions fit a one-hot policy alone"
+        )

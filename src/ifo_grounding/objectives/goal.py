@@ -1,0 +1,107 @@
+"""Learning whether an instruction is fulfilled: an extension of the paper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
+from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
+
+
+class GoalLoss(SupervisedLoss):
+    """Binary cross entropy of final frames against earlier ones and other instructions.
+
+    An extension, which assumes that demonstrations end in success. Positives are final frames with
+    their instructions. Negatives are, with half the weight each, earlier frames with their
+    instructions, and final frames with others of the pool, of which the probable false ones are
+    removed. Positives and negatives weigh the same; a class that a batch lacks counts 0. Writes
+    ``loss_goal``, ``final_probability``, ``unfinished_probability``, ``negative_probability`` and
+    ``removed``.
+
+    Args:
+        network: first image, image and instruction to a logit, as ``make_goal_judge`` builds it.
+        pool: token ids [P, L] of the instructions of the demonstrations.
+        removal_rate: share of a batch's other instructions to remove, those scored highest, or
+            ``"estimated"``.
+        warmup: share of training before which none is removed; see :meth:`set_progress`.
+        generator: where random numbers come from; None is the global generator.
+
+    Raises:
+        UserError: for a pool of fewer than two different instructions, or values out of range.
+
+    >>> from ifo_grounding.networks import Shapes, make_goal_judge
+    >>> pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
+    >>> judge = make_goal_judge(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
+    >>> frames = torch.zeros(4, 3, 48, 48, dtype=torch.uint8)
+    >>> losses = GoalLoss(judge, pool)(TensorDict({
+    ...     "initial_pixels": frames, "pixels": frames, "instruction": pool[:4],
+    ...     "final": torch.tensor([[True], [False], [False], [True]]),
+    ... }, [4]))
+    >>> losses["loss_goal"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` changes; the inputs' keys are the network's."""
+
+        final: NestedKey = "final"
+        """Whether a frame is the last of its demonstration, bool [*B, 1]."""
+
+    default_keys: Any = _AcceptedKeys
+    out_keys = [  # noqa: RUF012
+        "loss_goal",
+        "final_probability",
+        "unfinished_probability",
+        "negative_probability",
+        "removed",
+    ]
+
+    def __init__(
+        self,
+        network: TensorDictModule,
+        pool: Tensor,
+        *,
+        removal_rate: float | str = 0.0,
+        warmup: float = 1 / 3,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__(network)
+        self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator)
+
+    def set_progress(self, fraction: float) -> None:
+        """Say which share of training is done, in [0, 1]; until told, training counts as late."""
+        self.negatives.progress = fraction
+
+    def _extra_keys(self) -> list[NestedKey]:
+        return [self.tensor_keys.final]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute the loss of a batch of frames, some final."""
+        self._require(tensordict)
+        batch = flat(tensordict, self.in_keys)
+        final = batch.get(self.tensor_keys.final).reshape(-1).bool()
+        others = self.negatives.draw(batch.get(self.network.in_keys[-1]), 1)
+        with self._mode():
+            own, other = pair_scores(self.network, batch, others)
+        other = other[final, 0]
+        self.negatives.watch(own[final], other)
+        kept = self.negatives.keep(other)
+        finished = masked_mean(F.softplus(-own), final)
+        unfinished = masked_mean(F.softplus(own), ~final)
+        elsewhere = masked_mean(F.softplus(other), kept)
+        return scalars(
+            loss_goal=(finished + (unfinished + elsewhere) / 2) / 2,
+            final_probability=masked_mean(own.detach().sigmoid(), final),
+            unfinished_probability=masked_mean(own.detach().sigmoid(), ~final),
+            negative_probability=masked_mean(other.detach().sigmoid(), torch.ones_like(kept)),
+            removed=masked_mean((~kept).float(), torch.ones_like(kept)),
+        )

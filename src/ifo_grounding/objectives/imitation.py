@@ -1,0 +1,62 @@
+"""Learning to do what the labelled demonstrations do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+
+from ifo_grounding import keys
+from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
+
+
+class ImitationLoss(SupervisedLoss):
+    """Negative log-likelihood of the labelled actions under the policy (1st phase of the paper).
+
+    Writes ``loss_imitation``, ``accuracy`` and ``entropy``. TorchRL's ``BCLoss`` does not fit: it
+    takes integer actions for logits.
+
+    Args:
+        network: a policy with ``get_dist``, as ``make_policy`` builds it.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+
+    >>> import torch
+    >>> from ifo_grounding.networks import Shapes, make_policy
+    >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
+    >>> losses = ImitationLoss(policy)(TensorDict({
+    ...     "pixels": torch.zeros(2, 3, 48, 48, dtype=torch.uint8),
+    ...     "instruction": torch.ones(2, 16, dtype=torch.int64),
+    ...     "action": torch.tensor([0, 5]),
+    ... }, [2]))
+    >>> losses["loss_imitation"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` changes; the inputs' keys are the policy's."""
+
+        action: NestedKey = keys.ACTION
+        """The labelled action, integer [*B]."""
+
+    default_keys: Any = _AcceptedKeys
+    out_keys = ["loss_imitation", "accuracy", "entropy"]  # noqa: RUF012
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute the loss of a batch of labelled transitions."""
+        self._require(tensordict)
+        action = tensordict.get(self.tensor_keys.action)
+        with self._mode():
+            dist = self.network.get_dist(tensordict.select(*self.network.in_keys))
+        likeliest = dist.mode
+        check_action(action, likeliest.shape)
+        loss = -dist.log_prob(action)
+        right = (likeliest == action).reshape(*loss.shape, -1).all(-1)
+        return scalars(
+            loss_imitation=self._reduce_loss(loss, tensordict),
+            accuracy=self._mean(right, tensordict),
+            entropy=self._mean(dist.entropy(), tensordict),
+        )

@@ -1,0 +1,62 @@
+"""Learning which action led from one image to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+
+from ifo_grounding import keys
+from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
+
+
+class InverseLoss(SupervisedLoss):
+    """Cross entropy of the inverse module's action and the true one (1st phase of the paper).
+
+    Writes ``loss_inverse`` and ``accuracy``.
+
+    Args:
+        network: two images to logits, as ``make_inverse`` builds it.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+
+    >>> import torch
+    >>> from ifo_grounding.networks import Shapes, make_inverse
+    >>> inverse = make_inverse(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
+    >>> frames = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
+    >>> losses = InverseLoss(inverse)(TensorDict({
+    ...     "pixels": frames, "next": {"pixels": frames}, "action": torch.tensor([0, 5]),
+    ... }, [2]))
+    >>> losses["loss_inverse"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` changes; the images' keys are the network's."""
+
+        action: NestedKey = keys.ACTION
+        """The action taken, integer [*B]."""
+
+    default_keys: Any = _AcceptedKeys
+    out_keys = ["loss_inverse", "accuracy"]  # noqa: RUF012
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute the loss of a batch of transitions."""
+        self._require(tensordict)
+        action = tensordict.get(self.tensor_keys.action)
+        with self._mode():
+            out = self.network(tensordict.select(*self.network.in_keys))
+        logits = out.get(self.network.out_keys[0])
+        check_action(action, logits.shape[:-1])
+        action = action.long()
+        loss = F.cross_entropy(
+            logits.reshape(-1, logits.shape[-1]), action.reshape(-1), reduction="none"
+        )
+        return scalars(
+            loss_inverse=self._reduce_loss(loss.reshape(action.shape), tensordict),
+            accuracy=self._mean(logits.argmax(-1) == action, tensordict),
+        )

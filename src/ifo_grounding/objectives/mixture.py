@@ -1,0 +1,79 @@
+"""How many of the unlabelled are positive: the share of false negatives, estimated."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+SLACK = 0.01
+
+
+def best_bin_estimate(positive: Tensor, unlabelled: Tensor, delta: float = 0.1) -> float:
+    """Estimate the share of positives among unlabelled samples from a classifier's scores.
+
+    Above a threshold that hardly any true negative passes, the unlabelled are as frequent as the
+    positives times the share. The threshold is the one with the least upper confidence bound
+    (Garg et al., "Mixture Proportion Estimation and PU Learning: A Modern Approach", 2021).
+
+    Args:
+        positive: scores of positives [P].
+        unlabelled: scores of unlabelled samples [U].
+        delta: probability with which the bound may fail.
+
+    Returns:
+        The share, in [0, 1].
+
+    >>> positive = torch.linspace(1, 2, 5000)
+    >>> negative = torch.linspace(-2, -1, 9000)
+    >>> round(best_bin_estimate(positive, torch.cat([positive[::5], negative])), 2)
+    0.1
+    """
+    thresholds = positive.sort(descending=True).values
+    n_positive, n_unlabelled = len(positive), len(unlabelled)
+    above = torch.arange(1, n_positive + 1, device=positive.device) / n_positive
+    ordered = unlabelled.sort().values
+    passed = (n_unlabelled - torch.searchsorted(ordered, thresholds)) / n_unlabelled
+    width = math.sqrt(math.log(4 / delta) / 2) * (n_positive**-0.5 + n_unlabelled**-0.5)
+    best = ((passed + (1 + SLACK) * width) / above).argmin()
+    return float((passed[best] / above[best]).clamp(0, 1))
+
+
+class MixtureEstimate(nn.Module):
+    """Remembers recent scores of positives and unlabelled samples, and estimates from them.
+
+    Args:
+        size: scores of each kind to remember.
+
+    >>> estimate = MixtureEstimate(size=100)
+    >>> estimate.add(torch.ones(60), torch.cat([torch.ones(30), -torch.ones(30)]))
+    >>> estimate.share()
+    0.5
+    """
+
+    positive: Tensor
+    unlabelled: Tensor
+    count: Tensor
+
+    def __init__(self, size: int = 4096) -> None:
+        super().__init__()
+        self.size = size
+        self.register_buffer("positive", torch.zeros(size))
+        self.register_buffer("unlabelled", torch.zeros(size))
+        self.register_buffer("count", torch.zeros((), dtype=torch.int64))
+
+    @torch.no_grad()
+    def add(self, positive: Tensor, unlabelled: Tensor) -> None:
+        """Remember scores, the same number of each kind [N]; the oldest are forgotten."""
+        places = (self.count + torch.arange(len(positive), device=self.count.device)) % self.size
+        self.positive[places] = positive.detach().float()
+        self.unlabelled[places] = unlabelled.detach().float()
+        self.count += len(positive)
+
+    def share(self) -> float:
+        """Estimate the share of positives among the unlabelled; 0 before there are any scores."""
+        known = min(int(self.count), self.size)
+        if not known:
+            return 0.0
+        return best_bin_estimate(self.positive[:known], self.unlabelled[:known])

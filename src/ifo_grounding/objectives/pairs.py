@@ -1,0 +1,135 @@
+"""Negatives for classifiers of pairs: drawing other instructions, scoring, removing false ones."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.objectives.mixture import MixtureEstimate
+
+ESTIMATED = "estimated"
+MOST_REMOVED = 0.5
+
+
+class NegativeInstructions(nn.Module):
+    """Draws instructions from a pool that differ from a given one, and removes likely mistakes.
+
+    A random other instruction may suit a scene just as well. So after a warm-up the share
+    ``removal_rate`` of a batch's negatives that the classifier likes best is dropped (Bahdanau et
+    al. 2019, whom the paper cites). The share can be estimated from the scores of positives and
+    negatives (:func:`~ifo_grounding.objectives.mixture.best_bin_estimate`).
+
+    Args:
+        pool: token ids [P, L]; repeated rows count once.
+        removal_rate: share of negatives to drop, in [0, 1), or ``"estimated"``.
+        warmup: share of training before which none is dropped.
+        generator: where random numbers come from; None is the global generator.
+
+    Raises:
+        UserError: where the pool holds fewer than two different instructions.
+
+    >>> negatives = NegativeInstructions(torch.tensor([[1, 0], [2, 0], [2, 0]]), removal_rate=0.5)
+    >>> negatives.draw(torch.tensor([[1, 0], [2, 0]]), 1).tolist()
+    [[[2, 0]], [[1, 0]]]
+    >>> negatives.keep(torch.tensor([0.1, 0.9])).tolist()
+    [True, False]
+    """
+
+    pool: Tensor
+
+    def __init__(
+        self,
+        pool: Tensor,
+        removal_rate: float | str,
+        warmup: float = 1 / 3,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if pool.ndim != 2 or pool.dtype.is_floating_point:
+            raise UserError(f"pool must be token ids [P, L], got {pool.dtype} {list(pool.shape)}")
+        estimated = removal_rate == ESTIMATED
+        if not estimated and (isinstance(removal_rate, str) or not 0 <= removal_rate < 1):
+            raise UserError(
+                f"removal_rate must lie in [0, 1) or be 'estimated', got {removal_rate}"
+            )
+        distinct = torch.unique(pool, dim=0)
+        if len(distinct) < 2:
+            raise UserError("pool holds fewer than two different instructions: no negatives exist")
+        self.register_buffer("pool", distinct, persistent=False)
+        self.removal_rate = 0.0 if estimated else float(removal_rate)
+        self.estimate = MixtureEstimate() if estimated else None
+        self.warmup = warmup
+        self.generator = generator
+        self.progress = 1.0
+
+    def draw(self, instruction: Tensor, count: int) -> Tensor:
+        """Draw ``count`` instructions per row of [N, L], each uniform among all others: [N, K, L].
+
+        A draw that hits the row's own instruction is moved on by a random number of places, which
+        keeps it uniform, for the rows of the pool are distinct.
+        """
+        size = len(self.pool)
+        shape = (len(instruction), count)
+        index = self._randint(0, size, shape)
+        moved = (index + self._randint(1, size, shape)) % size
+        same = (self.pool[index] == instruction.unsqueeze(1)).all(-1)
+        return self.pool[torch.where(same, moved, index)]
+
+    def watch(self, own: Tensor, other: Tensor) -> None:
+        """Learn the share of suitable negatives from scores of positives [N] and negatives [N]."""
+        if self.estimate is not None:
+            self.estimate.add(own, other)
+            self.removal_rate = min(self.estimate.share(), MOST_REMOVED)
+
+    def keep(self, scores: Tensor) -> Tensor:
+        """Return a mask of ``scores`` [*] without the top share that is likely suitable."""
+        drop = int(self.removal_rate * scores.numel()) if self.progress >= self.warmup else 0
+        mask = torch.ones(scores.numel(), dtype=torch.bool, device=scores.device)
+        mask[scores.detach().flatten().topk(drop).indices] = False
+        return mask.reshape(scores.shape)
+
+    def _randint(self, low: int, high: int, shape: tuple[int, int]) -> Tensor:
+        device = self.pool.device if self.generator is None else self.generator.device
+        numbers = torch.randint(low, high, shape, generator=self.generator, device=device)
+        return numbers.to(self.pool.device)
+
+
+def pair_scores(
+    network: TensorDictModule, batch: TensorDictBase, others: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Score each row's own instruction and others: logits [N] and [N, K].
+
+    A network with ``encode_pixels``, ``encode_instruction`` and ``score`` encodes each row's
+    images and each distinct instruction once; any other runs once per pair.
+
+    Args:
+        network: images and an instruction, its last input, to a logit [*B, 1].
+        batch: its inputs, batch size [N].
+        others: token ids [N, K, L].
+    """
+    *pixel_keys, instruction_key = network.in_keys
+    both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
+    count = both.shape[1]
+    if all(hasattr(network, name) for name in ("encode_pixels", "encode_instruction", "score")):
+        features = network.encode_pixels(*(batch.get(key) for key in pixel_keys))
+        words = network.encode_instruction(both.flatten(0, 1))
+        repeated = features.unsqueeze(1).expand(-1, count, *features.shape[1:]).flatten(0, 1)
+        scores = network.score(repeated, words)
+    else:
+        rows = torch.arange(len(both), device=both.device).repeat_interleave(count)
+        pairs = batch.select(*pixel_keys)[rows].set(instruction_key, both.flatten(0, 1))
+        scores = network(pairs).get(network.out_keys[0])
+    scores = scores.reshape(-1, count)
+    return scores[:, 0], scores[:, 1:]
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Return the mean of ``values`` where ``mask``, 0 where nowhere.
+
+    >>> float(masked_mean(torch.tensor([1.0, 3.0]), torch.tensor([False, True])))
+    3.0
+    """
+    return torch.where(mask, values, 0).sum() / mask.sum().clamp_min(1)

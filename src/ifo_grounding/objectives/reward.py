@@ -1,0 +1,142 @@
+"""Learning which actions are right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError
+from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
+
+
+class RewardLoss(SupervisedLoss):
+    """Binary cross entropy of right actions against wrong ones (2nd phase of the paper).
+
+    Positives are the labelled actions of demonstrations. Before self-examination (:meth:`forward`)
+    negatives are randomly different actions; during it (:meth:`adversarial`) they are the policy's
+    own actions. Positives and negatives weigh the same. Both write ``loss_reward``,
+    ``positive_probability`` and ``negative_probability``.
+
+    Args:
+        network: an image, an instruction and an action, its last input, to a logit, as
+            ``make_reward_model`` builds it. With ``all_actions`` images are encoded once for both
+            actions.
+        n_actions: number of actions.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        generator: where random numbers come from; None is the global generator.
+
+    >>> from ifo_grounding.networks import Shapes, make_reward_model
+    >>> rwd = make_reward_model(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
+    >>> batch = TensorDict({
+    ...     "pixels": torch.zeros(2, 3, 48, 48, dtype=torch.uint8),
+    ...     "instruction": torch.ones(2, 16, dtype=torch.int64),
+    ...     "action": torch.tensor([0, 5]),
+    ... }, [2])
+    >>> RewardLoss(rwd)(batch)["loss_reward"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` changes; the inputs' keys are the network's."""
+
+        action: NestedKey = keys.ACTION
+        """The labelled action, integer [*B]."""
+
+    default_keys: Any = _AcceptedKeys
+    out_keys = ["loss_reward", "positive_probability", "negative_probability"]  # noqa: RUF012
+
+    def __init__(
+        self,
+        network: TensorDictModule,
+        *,
+        n_actions: int | None = None,
+        reduction: str = "mean",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__(network, reduction=reduction)
+        known = getattr(getattr(network, "shapes", None), "n_actions", None)
+        self.n_actions = n_actions or known or keys.N_ACTIONS
+        if self.n_actions < 2:
+            raise UserError("a single action has no different ones to serve as negatives")
+        self.generator = generator
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute the loss of labelled actions against randomly different ones."""
+        self._require(tensordict)
+        action = tensordict.get(self.tensor_keys.action).long()
+        both = torch.stack([action, self._different(action)], -1)
+        with self._mode():
+            right, wrong = self._scores(tensordict, both).unbind(-1)
+        return self._losses(F.softplus(-right), F.softplus(wrong), right, wrong, tensordict)
+
+    def adversarial(
+        self, demonstrations: TensorDictBase, policy: TensorDictBase, smoothing: float = 0.1
+    ) -> TensorDict:
+        """Compute the loss of labelled actions against the policy's own (self-examination).
+
+        Args:
+            demonstrations: transitions with labelled actions, as for :meth:`forward`.
+            policy: transitions with the policy's actions, of any batch size.
+            smoothing: how far the targets are from 1 and 0, for the policy is often right.
+        """
+        self._require(demonstrations)
+        self._require(policy)
+        with self._mode():
+            right = self._scores(demonstrations, self._actions(demonstrations)).squeeze(-1)
+            wrong = self._scores(policy, self._actions(policy)).squeeze(-1)
+        positive = F.binary_cross_entropy_with_logits(
+            right, torch.full_like(right, 1 - smoothing), reduction="none"
+        )
+        negative = F.binary_cross_entropy_with_logits(
+            wrong, torch.full_like(wrong, smoothing), reduction="none"
+        )
+        return self._losses(positive, negative, right, wrong)
+
+    def _losses(
+        self,
+        positive: Tensor,
+        negative: Tensor,
+        right: Tensor,
+        wrong: Tensor,
+        tensordict: TensorDictBase | None = None,
+    ) -> TensorDict:
+        halves = [self._reduce_loss(half, tensordict) for half in (positive, negative)]
+        return scalars(
+            loss_reward=(halves[0] + halves[1]) / 2,
+            positive_probability=self._mean(right.sigmoid(), tensordict),
+            negative_probability=self._mean(wrong.sigmoid(), tensordict),
+        )
+
+    def _actions(self, tensordict: TensorDictBase) -> Tensor:
+        return tensordict.get(self.tensor_keys.action).long().unsqueeze(-1)
+
+    def _different(self, action: Tensor) -> Tensor:
+        """Draw another action than ``action`` [*B], uniform among the others."""
+        device = action.device if self.generator is None else self.generator.device
+        step = torch.randint(
+            1, self.n_actions, action.shape, generator=self.generator, device=device
+        )
+        return (action + step.to(action.device)) % self.n_actions
+
+    def _scores(self, tensordict: TensorDictBase, actions: Tensor) -> Tensor:
+        """Score several actions [*B, K] of each state: logits [*B, K]."""
+        *input_keys, action_key = self.network.in_keys
+        check_action(actions[..., 0], tuple(tensordict.get(input_keys[-1]).shape[:-1]))
+        if hasattr(self.network, "all_actions"):
+            every = self.network.all_actions(*(tensordict.get(key) for key in input_keys))
+            return every.gather(-1, actions)
+        inputs = tensordict.select(*input_keys)
+        columns = [
+            self.network(inputs.copy().set(action_key, action)).get(self.network.out_keys[0])
+            for action in actions.unbind(-1)
+        ]
+        return torch.cat(columns, -1)

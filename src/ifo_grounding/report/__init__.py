@@ -1,0 +1,45 @@
+"""Showing what was learned: tables, plots, animations, case studies, and one page with all."""
+
+from ifo_grounding.report.animation import animation, save_animation
+from ifo_grounding.report.casestudy import (
+    Case,
+    changed_scenes,
+    gallery,
+    improved_episodes,
+    instruction_cases,
+)
+from ifo_grounding.report.metrics import read_metrics
+from ifo_grounding.report.page import write_report
+from ifo_grounding.report.plots import (
+    confusion,
+    figure_png,
+    phase_bars,
+    save_figure,
+    success_over_iterations,
+    training_curves,
+)
+from ifo_grounding.report.results import results_rows, results_table
+from ifo_grounding.report.tables import format_cell, markdown_table, text_table
+
+__all__ = [
+    "Case",
+    "animation",
+    "changed_scenes",
+    "confusion",
+    "figure_png",
+    "format_cell",
+    "gallery",
+    "improved_episodes",
+    "instruction_cases",
+    "markdown_table",
+    "phase_bars",
+    "read_metrics",
+    "results_rows",
+    "results_table",
+    "save_animation",
+    "save_figure",
+    "success_over_iterations",
+    "text_table",
+    "training_curves",
+    "write_report",
+]

@@ -1,0 +1,112 @@
+"""Animations of episodes, with the instruction below."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from PIL import Image
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation.recording import Episode
+from ifo_grounding.files import atomic_write
+from ifo_grounding.report.drawing import BAD, GOOD, RUNNING, Cell, Sheet
+
+COLOURS = 128
+"""Colours of an animation; the world has a few dozen."""
+
+
+def animation(
+    episodes: Sequence[Episode],
+    *,
+    titles: Sequence[str] | None = None,
+    columns: int = 4,
+    width: int = 200,
+    fps: float = 4.0,
+    hold: float = 2.0,
+) -> bytes:
+    """Return episodes side by side as a GIF that repeats.
+
+    The border of an episode turns green when it ends in success and orange when it fails, and a
+    word says so; it then waits for the others.
+
+    Args:
+        episodes: what to show, such as :func:`~ifo_grounding.evaluation.record_episodes` returns.
+        titles: a word above each, such as ``phase 1``.
+        columns: episodes side by side.
+        width: about how wide an episode is drawn, in pixels; frames are enlarged without blur.
+        fps: actions per second.
+        hold: seconds for which the end is shown.
+
+    Raises:
+        UserError: without episodes, or where titles do not match them.
+
+    >>> import numpy as np
+    >>> frames = np.zeros((3, 3, 48, 48), dtype=np.uint8)
+    >>> episode = Episode(frames, np.array([1, 5]), "move to the red circle", True, True, 0)
+    >>> Image.open(io.BytesIO(animation([episode]))).n_frames
+    3
+    """
+    if not episodes:
+        raise UserError("an animation needs at least one episode")
+    if titles is not None and len(titles) != len(episodes):
+        raise UserError(f"titles must be one per episode, got {len(titles)} of {len(episodes)}")
+    sheet = Sheet(
+        [episode.sentence for episode in episodes],
+        columns=columns,
+        width=width,
+        titled=titles is not None,
+    )
+    labels = titles or [""] * len(episodes)
+    steps = max(len(episode.frames) for episode in episodes)
+    pictures = [
+        sheet.draw([_cell(e, label, step) for e, label in zip(episodes, labels, strict=True)])
+        for step in range(steps)
+    ]
+    return _gif(pictures, fps, hold)
+
+
+def save_animation(path: str | Path, episodes: Sequence[Episode], **options: object) -> Path:
+    """Write :func:`animation` to a file, atomically; options are the same."""
+    content = animation(episodes, **options)  # type: ignore[arg-type]
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+    return Path(path)
+
+
+def _cell(episode: Episode, title: str, step: int) -> Cell:
+    last = len(episode.frames) - 1
+    frame, ended = episode.frames[min(step, last)], step >= last
+    if not ended:
+        note = (
+            f"step {step}"
+            if step == 0
+            else f"step {step}: {keys.ACTIONS[episode.actions[step - 1]]}"
+        )
+        return Cell(frame, episode.sentence, title, note, RUNNING)
+    ending = "success" if episode.success else "failure"
+    note = f"{ending} after {last}" if episode.stopped else f"{ending}, never stopped"
+    return Cell(frame, episode.sentence, title, note, GOOD if episode.success else BAD)
+
+
+def _gif(pictures: Sequence[Image.Image], fps: float, hold: float) -> bytes:
+    # One palette, from the first and the last picture, keeps colours from flickering.
+    both = Image.new("RGB", (pictures[0].width, 2 * pictures[0].height))
+    both.paste(pictures[0], (0, 0))
+    both.paste(pictures[-1], (0, pictures[0].height))
+    palette = both.quantize(COLOURS, dither=Image.Dither.NONE)
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    durations = [round(1000 / fps)] * (len(frames) - 1) + [round(1000 * hold)]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=durations,
+        loop=0,
+        disposal=1,
+    )
+    return buffer.getvalue()

@@ -1,0 +1,146 @@
+"""Case studies: chosen instructions, and episodes that only phase 2 solves (Fig. 5 and 6)."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation.episodes import Policy
+from ifo_grounding.evaluation.recording import Episode, record_episodes
+from ifo_grounding.evaluation.success import SuccessResult
+from ifo_grounding.evaluation.suitability import NOT_SERVED, judged_choices, read_pool
+from ifo_grounding.report.drawing import BAD, GOOD, Cell, Sheet
+from ifo_grounding.tasks.goals import REASONS
+from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.world import render
+
+PICTURE_TILE_SIZE = 32
+
+
+@dataclass(frozen=True)
+class Case:
+    """A picture, a sentence and a verdict."""
+
+    picture: np.ndarray
+    """Pixels, uint8 [3, H, W]."""
+    sentence: str
+    """The instruction."""
+    good: bool
+    """Whether it is suitable."""
+    note: str
+    """What the oracle says of it, and the probability that the classifier gave to it."""
+
+
+def instruction_cases(
+    classifier: TensorDictModuleBase,
+    task: str,
+    pool: Tensor | Sequence[str],
+    *,
+    count: int = 12,
+    unsuitable: int | None = None,
+    search: int = 512,
+    picture_tile_size: int = PICTURE_TILE_SIZE,
+    **options: Any,
+) -> list[Case]:
+    """Return instructions that a classifier chose, with the oracle's verdicts: the suitable first.
+
+    Unsuitable choices are what there is to learn from, so they are shown beyond their share.
+
+    Args:
+        classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
+        task: name of the task.
+        pool: the instructions to choose from.
+        count: how many cases at most.
+        unsuitable: how many of them may be unsuitable; a third by default.
+        search: states among which to look for cases.
+        picture_tile_size: pixels along one side of a cell in the pictures.
+        options: of :func:`~ifo_grounding.evaluation.suitable_rate`, such as ``threshold``.
+    """
+    judged = judged_choices(classifier, task, pool, states=search, **options)
+    tokens, _ = read_pool(task, pool)
+    wrong = (judged.verdict > 0).nonzero().squeeze(-1).tolist()
+    right = (judged.verdict == 0).nonzero().squeeze(-1).tolist()
+    wrong = wrong[: count // 3 if unsuitable is None else unsuitable]
+    rows = [*right[: count - len(wrong)], *wrong]
+    assert not any(judged.verdict[row] == NOT_SERVED for row in rows)
+    if not rows:
+        return []
+    pictures = render(judged.state[torch.tensor(rows)], picture_tile_size).cpu().numpy()
+    sentences = VOCABULARY.decode(tokens[judged.chosen[rows].cpu()])
+    return [
+        Case(
+            picture=picture,
+            sentence=sentence,
+            good=not judged.verdict[row],
+            note=f"{REASONS[int(judged.verdict[row])]} ({float(judged.score[row]):.2f})",
+        )
+        for row, picture, sentence in zip(rows, pictures, sentences, strict=True)
+    ]
+
+
+def gallery(cases: Sequence[Case], *, columns: int = 4, width: int = 200) -> bytes:
+    """Return cases side by side as a PNG.
+
+    >>> case = Case(np.zeros((3, 48, 48), dtype=np.uint8), "move to the red circle", True, "fits")
+    >>> gallery([case])[1:4]
+    b'PNG'
+    """
+    if not cases:
+        raise UserError("a gallery needs at least one case")
+    sheet = Sheet([case.sentence for case in cases], columns=columns, width=width)
+    cells = [
+        Cell(case.picture, case.sentence, note=case.note, colour=GOOD if case.good else BAD)
+        for case in cases
+    ]
+    buffer = io.BytesIO()
+    sheet.draw(cells).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def changed_scenes(
+    before: SuccessResult, after: SuccessResult, *, improved: bool = True
+) -> list[int]:
+    """Return the scenes that the first policy fails and the second solves, or the other way.
+
+    Raises:
+        UserError: where the results are about different scenes.
+    """
+    if before.scenes != after.scenes:
+        raise UserError("the two results are about different scenes: use the same seed and stream")
+    won, lost = (after, before) if improved else (before, after)
+    changed = won.outcomes & ~lost.outcomes
+    return [int(scene) for scene in changed.nonzero().squeeze(-1)]
+
+
+def improved_episodes(
+    first: Policy,
+    second: Policy,
+    task: str,
+    scenes: Sequence[int],
+    **options: Any,
+) -> tuple[list[Episode], list[str]]:
+    """Play scenes with both policies, for :func:`~ifo_grounding.report.animation`.
+
+    Args:
+        first: the policy of phase 1.
+        second: the policy of phase 2.
+        task: name of the task.
+        scenes: which, such as ``changed_scenes(before, after)[:4]``.
+        options: of :func:`~ifo_grounding.evaluation.record_episodes`; ``seed`` and ``stream`` as
+            for the results that the scenes come from.
+
+    Returns:
+        Episodes, all of the first policy and then all of the second, and a title for each: with
+        ``columns=len(scenes)`` both tries of a scene are in one column.
+    """
+    tries = [record_episodes(policy, task, scenes, **options) for policy in (first, second)]
+    titles = [f"phase {phase}" for phase in (1, 2) for _ in scenes]
+    return [*tries[0], *tries[1]], titles

@@ -1,0 +1,72 @@
+"""The results of one run as a table, whether they were just measured or read from a file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from ifo_grounding.report.tables import text_table
+from ifo_grounding.stats import Difference, Estimate, Rate
+
+Measured = TypeVar("Measured", Rate, Estimate, Difference)
+
+
+def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return one row per measurement of a run, in the order of the pipeline.
+
+    Args:
+        results: what the recipe ``evaluate`` measured, as plain values; what is missing is left
+            out.
+
+    >>> from ifo_grounding.stats import wilson
+    >>> rows = results_rows({"labels": {"rate": wilson(9, 10).as_dict(), "worst": "P",
+    ...     "per_action": {"P": wilson(1, 2).as_dict()}}})
+    >>> [row["measured"] for row in rows]
+    ['inverse accuracy', 'inverse accuracy, worst action (P)']
+    """
+    rows: list[dict[str, Any]] = []
+
+    def add(measured: str, value: Any) -> None:
+        rows.append({"measured": measured, "result [95% interval]": value})
+
+    if labels := results.get("labels"):
+        worst = labels["worst"]
+        add("inverse accuracy", restored(Rate, labels["rate"]))
+        add(
+            f"inverse accuracy, worst action ({worst})", restored(Rate, labels["per_action"][worst])
+        )
+    for phase in (1, 2):
+        if success := results.get(f"phase{phase}"):
+            add(f"phase {phase} success, {success['mode']}", restored(Rate, success["rate"]))
+            if sampled := success.get("sampled"):
+                add(f"phase {phase} success, sampled", restored(Rate, sampled["rate"]))
+    if gain := results.get("gain"):
+        add("phase 2 - phase 1, paired, points", restored(Difference, gain))
+    if choices := results.get("suitability"):
+        add("suitable rate of chosen instructions", restored(Rate, choices["rate"]))
+        add("states served", restored(Rate, choices["served"]))
+        add("recall of suitable pairs", restored(Rate, choices["recall"]))
+    if reward := results.get("action_reward"):
+        add("action reward against the expert, AUC", restored(Estimate, reward["auc"]))
+    for kind in ("action", "goal"):
+        if audit := results.get(f"{kind}_return"):
+            add(f"{kind} return against true success, AUC", restored(Estimate, audit["auc"]))
+    return rows
+
+
+def restored(kind: type[Measured], values: Mapping[str, Any]) -> Measured:
+    """Return a measurement that was written as plain values, where None is undefined.
+
+    >>> print(restored(Rate, {"rate": None, "low": 0.0, "high": 1.0, "successes": 0, "count": 0}))
+    undefined (n=0)
+    """
+    known: dict[str, Any] = {
+        key: math.nan if value is None else value for key, value in values.items()
+    }
+    return kind(**known)
+
+
+def results_table(results: Mapping[str, Any]) -> str:
+    """Return :func:`results_rows` as a table for the terminal."""
+    return text_table(results_rows(results))

@@ -1,0 +1,28 @@
+"""Rates, differences and areas under the ROC curve, each with its interval.
+
+Numbers go in and out as numpy arrays or anything that becomes one. Everything that resamples is a
+function of its ``seed``.
+"""
+
+from ifo_grounding.stats.association import auc, correlation
+from ifo_grounding.stats.rates import (
+    RESAMPLES,
+    holm,
+    paired_difference,
+    two_level_bootstrap,
+    wilson,
+)
+from ifo_grounding.stats.results import Difference, Estimate, Rate
+
+__all__ = [
+    "RESAMPLES",
+    "Difference",
+    "Estimate",
+    "Rate",
+    "auc",
+    "correlation",
+    "holm",
+    "paired_difference",
+    "two_level_bootstrap",
+    "wilson",
+]

@@ -1,0 +1,121 @@
+"""Numbers with their intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ifo_grounding.errors import UserError
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _digits(rate: float) -> int:
+    """Decimals of a percentage that do not round a rare failure or success away."""
+    rare = min(rate, 1.0 - rate)
+    return 1 if rare == 0.0 or rare >= 0.0005 else 2 if rare >= 0.00005 else 3
+
+
+class _Described:
+    """Gives a result dataclass a form for JSON, undefined numbers as None."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as plain values for JSON; what is undefined becomes None."""
+        fields = asdict(self)  # type: ignore[call-overload]
+        return {k: _finite(v) if isinstance(v, float) else v for k, v in fields.items()}
+
+
+@dataclass(frozen=True)
+class Rate(_Described):
+    """A share of successes with its interval; shares lie within 0..1.
+
+    >>> print(Rate(0.973, 0.961, 0.982, successes=1946, count=2000, method="wilson"))
+    97.3% [96.1, 98.2] (n=2000)
+    """
+
+    rate: float
+    """Successes / count; not a number where count is 0."""
+    low: float
+    """Lower bound of the interval."""
+    high: float
+    """Upper bound of the interval."""
+    successes: int
+    """How many succeeded."""
+    count: int
+    """Out of how many."""
+    method: str = "wilson"
+    """How the interval was computed."""
+
+    def __str__(self) -> str:
+        """Return the rate in percent, its interval and the count."""
+        if not self.count:
+            return "undefined (n=0)"
+        digits = _digits(self.rate)
+        rate, low, high = (f"{100 * x:.{digits}f}" for x in (self.rate, self.low, self.high))
+        return f"{rate}% [{low}, {high}] (n={self.count})"
+
+
+@dataclass(frozen=True)
+class Estimate(_Described):
+    """A number other than a rate (an area, a correlation) with its interval.
+
+    >>> print(Estimate(0.912, 0.9, 0.924, count=500, method="delong"))
+    0.912 [0.900, 0.924] (n=500)
+    """
+
+    value: float
+    """The estimate; not a number where it is undefined."""
+    low: float
+    """Lower bound of the interval."""
+    high: float
+    """Upper bound of the interval."""
+    count: int
+    """How many observations it rests on."""
+    method: str
+    """How it was computed."""
+
+    def __str__(self) -> str:
+        """Return the value, its interval and the count."""
+        if not math.isfinite(self.value):
+            return f"undefined (n={self.count})"
+        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}] (n={self.count})"
+
+
+@dataclass(frozen=True)
+class Difference(_Described):
+    """What changed between two policies on the same scenes, in percentage points.
+
+    >>> print(Difference(2.5, 1.0, 4.0, better=60, worse=10, count=2000, p_value=1e-9, method=""))
+    +2.5 points [+1.0, +4.0] (60 better, 10 worse, n=2000)
+    """
+
+    points: float
+    """Mean of after minus before, in percentage points."""
+    low: float
+    """Lower bound of the interval, in points."""
+    high: float
+    """Upper bound of the interval, in points."""
+    better: int
+    """Scenes that failed before and succeed after."""
+    worse: int
+    """Scenes that succeeded before and fail after."""
+    count: int
+    """Pairs compared."""
+    p_value: float
+    """Two-sided p-value of no difference."""
+    method: str
+    """How interval and p-value were computed."""
+
+    def __str__(self) -> str:
+        """Return the difference, its interval and how many scenes changed."""
+        changed = f"{self.better} better, {self.worse} worse, n={self.count}"
+        return f"{self.points:+.1f} points [{self.low:+.1f}, {self.high:+.1f}] ({changed})"
+
+
+def check_confidence(confidence: float) -> None:
+    """Raise :class:`UserError` unless a confidence is a probability."""
+    if not 0.0 < confidence < 1.0:
+        raise UserError(f"confidence must lie between 0 and 1 (such as 0.95), got {confidence}")

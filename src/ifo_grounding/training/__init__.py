@@ -1,0 +1,23 @@
+"""The supervised loop and the self-examination loop that the recipes share."""
+
+from ifo_grounding.training.adversary import Adversary
+from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
+from ifo_grounding.training.pairs import load_pairs, save_pairs, select_pairs
+from ifo_grounding.training.run import Run, Stage
+from ifo_grounding.training.self_examination import SelfExaminationConfig, self_examine
+from ifo_grounding.training.supervised import FitConfig, fit
+
+__all__ = [
+    "Adversary",
+    "Checkpoint",
+    "FitConfig",
+    "Run",
+    "SelfExaminationConfig",
+    "Stage",
+    "fingerprint",
+    "fit",
+    "load_pairs",
+    "save_pairs",
+    "select_pairs",
+    "self_examine",
+]

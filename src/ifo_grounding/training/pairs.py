@@ -1,0 +1,155 @@
+"""The paper's fixed set of chosen starts: pairs of a scene and a suitable instruction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.files import atomic_write
+from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
+from ifo_grounding.seeding import generator
+from ifo_grounding.transforms.choosing import PoolScorer, check_pool, choose_instructions
+from ifo_grounding.transforms.sampler import NothingSuitableError
+from ifo_grounding.transforms.starts import FRAME_HASH, check_pairs, frame_hash
+
+SCORE = "score"
+"""Key of the probability that a stored pair is suitable, float32 [N, 1]."""
+FRUITLESS_RESETS = 100
+"""Resets in a row that may serve no state before the search is given up."""
+
+
+def select_pairs(
+    env: EnvBase,
+    classifier: TensorDictModuleBase,
+    pool: Tensor,
+    n: int,
+    *,
+    threshold: float = 0.8,
+    candidates: int = 64,
+    choose: str = "random",
+    seed: int = 0,
+    progress: bool = False,
+) -> TensorDict:
+    """Store ``n`` scenes of a simulator, each with a suitable instruction (5K or 10K in the paper).
+
+    Only first frames are looked at. :class:`ifo_grounding.transforms.StartingPairs` begins episodes
+    with the pairs, in an environment made with the same arguments.
+
+    Args:
+        env: simulator without instructions, with ``scene_numbers`` of its running episodes.
+        classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
+        pool: token ids of the instructions, int64 [N, L]; duplicates count once.
+        n: number of pairs.
+        threshold: least probability of a suitable pair.
+        candidates: instructions scored for each state; the whole pool if it is smaller.
+        choose: ``random`` among the suitable ones, or the ``best``.
+        seed: seed of the choices.
+        progress: whether to show a progress bar.
+
+    Returns:
+        TensorDict [n] on the CPU: ``scene`` int64 [n, 1], ``instruction`` int64 [n, L], ``score``
+        float32 [n, 1], ``frame_hash`` int64 [n, 1].
+
+    Raises:
+        UserError: on a simulator that does not number its scenes, or an impossible option.
+        NothingSuitableError: where 100 resets in a row bring no suitable pair.
+
+    >>> from tensordict.nn import TensorDictModule
+    >>> from ifo_grounding.envs import PickAndPlaceEnv
+    >>> classifier = TensorDictModule(
+    ...     lambda pixels, instruction: torch.full((len(pixels), 1), 9.0),
+    ...     ["pixels", "instruction"], ["suitability"],
+    ... )
+    >>> env = PickAndPlaceEnv("move", num_envs=4, seed=0, instructed=False)
+    >>> pairs = select_pairs(env, classifier, torch.ones(1, 16).long(), 6)
+    >>> pairs["scene"].squeeze(-1).tolist()
+    [0, 1, 2, 3, 4, 5]
+    """
+    if n < 1:
+        raise UserError(f"the number of pairs must be at least 1, got {n}")
+    if not isinstance(getattr(env, "scene_numbers", None), Tensor):
+        raise UserError("select_pairs needs an environment with scene_numbers: PickAndPlaceEnv")
+    if INSTRUCTION in env.full_observation_spec.keys(True, True):
+        raise UserError("select_pairs chooses the instructions: use instructed=False")
+    scorer = PoolScorer(classifier, check_pool(pool).unique(dim=0))
+    source = generator(seed, "select-pairs")
+    found: list[TensorDict] = []
+    count, fruitless, best_score = 0, 0, 0.0
+    with tqdm(total=n, desc="pairs", disable=not progress) as bar:
+        while count < n:
+            pixels = env.reset()[PIXELS].flatten(0, -4)
+            choices = choose_instructions(
+                scorer,
+                None,
+                pixels,
+                threshold=threshold,
+                candidates=candidates,
+                choose=choose,
+                generator=source,
+            )
+            rows = (choices.chosen >= 0).nonzero().squeeze(-1)[: n - count]
+            fruitless = 0 if len(rows) else fruitless + 1
+            best_score = max(best_score, float(choices.score.max()))
+            if fruitless >= FRUITLESS_RESETS:
+                raise NothingSuitableError(
+                    f"no instruction of the pool scored above {threshold} on any of the last "
+                    f"{fruitless * len(pixels)} states (best score seen: {best_score:.2f}): lower "
+                    "threshold, raise candidates, or train the classifier longer"
+                )
+            found.append(_pairs(env.scene_numbers.flatten(), pixels, choices, scorer.pool, rows))
+            count += len(rows)
+            bar.update(len(rows))
+    return torch.cat(found)
+
+
+def _pairs(
+    scenes: Tensor,
+    pixels: Tensor,
+    choices: tuple[Tensor, Tensor],
+    pool: Tensor,
+    rows: Tensor,
+) -> TensorDict:
+    index, score = choices
+    entries = {
+        SCENE: scenes[rows].unsqueeze(-1),
+        INSTRUCTION: pool.to(index.device)[index[rows]],
+        SCORE: score[rows].unsqueeze(-1),
+        FRAME_HASH: frame_hash(pixels[rows]).unsqueeze(-1),
+    }
+    return TensorDict(entries, batch_size=[len(rows)]).cpu()
+
+
+def save_pairs(pairs: TensorDictBase, path: str | Path) -> None:
+    """Write pairs as safetensors, atomically."""
+    tensors = {key: value.contiguous().cpu() for key, value in check_pairs(pairs).items()}
+    with atomic_write(path) as temporary:
+        save_file(tensors, str(temporary))
+
+
+def load_pairs(path: str | Path) -> TensorDict:
+    """Read pairs that :func:`save_pairs` wrote.
+
+    Raises:
+        UserError: where the file is missing, damaged, or holds something else.
+    """
+    try:
+        tensors = load_file(str(path))
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist: make it with select_pairs") from None
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{path} holds no pairs ({error}): make them with select_pairs") from None
+    lengths = {len(tensor) if tensor.ndim else 0 for tensor in tensors.values()}
+    if len(lengths) != 1:
+        raise UserError(f"{path} holds no pairs: its entries have different lengths")
+    pairs = TensorDict(tensors, batch_size=[lengths.pop()])
+    check_pairs(pairs)
+    return pairs

@@ -1,0 +1,136 @@
+"""A run: one folder whose stages are done once, in order, and continue where they were killed."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.files import home, read_json, write_json
+from ifo_grounding.training.checkpoint import fingerprint
+from ifo_grounding.training.supervised import Log, Metrics
+
+LOGGERS = ("csv", "tensorboard", "wandb", "none")
+
+
+class Run:
+    """Folder of a run.
+
+    Args:
+        name: name of the run under the home folder (see :func:`ifo_grounding.files.home`), or a
+            path to a folder anywhere.
+        logger: ``csv``, ``tensorboard``, ``wandb`` or ``none``: where metrics go while training.
+
+    >>> import tempfile
+    >>> run = Run(tempfile.mkdtemp())
+    >>> stage = run.stage("count", {"to": 3})
+    >>> stage.result is None
+    True
+    >>> stage.finish({"counted": 3})["counted"]
+    3
+    >>> run.stage("count", {"to": 3}).result["counted"]
+    3
+    """
+
+    def __init__(self, name: str | Path, logger: str = "csv") -> None:
+        check_choice("logger", logger, LOGGERS)
+        given = Path(name).expanduser()
+        self.folder = (
+            given if given.is_absolute() or len(given.parts) > 1 else home() / "runs" / name
+        )
+        self.logger = logger
+
+    def __truediv__(self, name: str) -> Path:
+        """Return the path of something in the run's folder."""
+        return self.folder / name
+
+    def need(self, name: str, recipe: str) -> Path:
+        """Return the path of what an earlier recipe made.
+
+        Raises:
+            UserError: where it is not there, with the recipe that makes it.
+        """
+        path = self.folder / name
+        if not path.exists():
+            raise UserError(f"{path} is missing: run the recipe {recipe} with the same run first")
+        return path
+
+    def stage(self, name: str, settings: Any, needs: Sequence[str] = ()) -> Stage:
+        """Return a stage, done only if its settings and all that it needs are as they were."""
+        earlier = {need: self.record(need).get("settings") for need in needs}
+        return Stage(self, name, fingerprint(settings, earlier))
+
+    def record(self, name: str) -> dict[str, Any]:
+        """Return what a stage left when it was done, empty where it was not."""
+        path = self._record_path(name)
+        return read_json(path) if path.exists() else {}
+
+    def _record_path(self, name: str) -> Path:
+        return self.folder / "stages" / f"{name}.json"
+
+
+class Stage:
+    """One step of a run, such as training one network.
+
+    Attributes:
+        settings: fingerprint of all that decides its result.
+        result: what :meth:`finish` was given, or None where the stage is still to be done.
+        checkpoint: file for its checkpoint.
+    """
+
+    def __init__(self, run: Run, name: str, settings: str) -> None:
+        self.run, self.name, self.settings = run, name, settings
+        record = run.record(name)
+        self.result: dict[str, Any] | None = None
+        if record.get("settings") == settings:
+            self.result = record["result"]
+        self.checkpoint = run.folder / "checkpoints" / f"{name}.pt"
+        self._start = time.monotonic()
+
+    def finish(
+        self, result: dict[str, Any], history: Sequence[Metrics] | None = None
+    ) -> dict[str, Any]:
+        """Record that the stage is done, drop its checkpoint, and return ``result``."""
+        seconds = round(time.monotonic() - self._start, 1)
+        if history is not None:
+            write_json(self.run.folder / "metrics" / f"{self.name}.json", list(history))
+        record = {"settings": self.settings, "result": result, "seconds": seconds}
+        write_json(self.run._record_path(self.name), record)
+        self.checkpoint.unlink(missing_ok=True)
+        self.result = result
+        return result
+
+    def log(self) -> Log | None:
+        """Return a function that sends metrics to the run's TorchRL logger.
+
+        After a kill, steps that are logged already are not logged again: a continued run repeats
+        them exactly.
+        """
+        if self.run.logger == "none":
+            return None
+        from torchrl.record.loggers import get_logger
+
+        folder = self.run.folder / "logs"
+        logged = _last_step(folder / self.name) if self.checkpoint.exists() else -1
+        options = (
+            {"wandb_kwargs": {"project": "ifo-grounding"}} if self.run.logger == "wandb" else {}
+        )
+        logger: Any = get_logger(self.run.logger, str(folder), self.name, **options)
+
+        def log(metrics: Metrics, step: int) -> None:
+            if step > logged:
+                for key, value in metrics.items():
+                    logger.log_scalar(f"{self.name}/{key}", value, step=step)
+
+        return log
+
+
+def _last_step(folder: Path) -> int:
+    last = -1
+    for path in folder.rglob("*.csv"):
+        with path.open(newline="") as file:
+            last = max([last, *(int(float(row[0])) for row in csv.reader(file) if row)])
+    return last

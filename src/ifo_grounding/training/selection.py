@@ -1,0 +1,101 @@
+"""Keeping the best policy by what the learner itself can measure."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from ifo_grounding import keys
+
+STANDARD_ERRORS = 1.0
+"""How clearly a policy has to be better than the best one so far."""
+
+
+@torch.no_grad()
+def learned_returns(env: EnvBase, policy: nn.Module, episodes: int, max_steps: int) -> Tensor:
+    """Play one episode per chosen start and add up its learned rewards.
+
+    Args:
+        env: batched; its transforms choose instructions and pay learned rewards.
+        policy: plays greedily.
+        episodes: how many, rounded up to whole batches of the env.
+        max_steps: after which an episode counts as it is.
+
+    Returns:
+        Learned return of each episode, float32 [episodes].
+    """
+    batches = math.ceil(episodes / env.batch_size.numel())
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return torch.cat([_batch_returns(env, policy, max_steps) for _ in range(batches)])[
+            :episodes
+        ]
+
+
+def _batch_returns(env: EnvBase, policy: nn.Module, max_steps: int) -> Tensor:
+    state: TensorDictBase = env.reset()
+    rows = env.batch_size.numel()
+    total = torch.zeros(rows)
+    alive = torch.ones(rows, dtype=torch.bool)
+    for _ in range(max_steps):
+        action = torch.zeros(rows, dtype=torch.int64, device=state[keys.PIXELS].device)
+        running = alive.to(action.device)
+        action[running] = policy(state[running])[keys.ACTION]
+        stepped = env.step(state.set(keys.ACTION, action))
+        after = stepped[keys.NEXT]
+        total += after[keys.LEARNED_REWARD].reshape(-1).cpu() * alive
+        alive &= ~after["done"].reshape(-1).cpu()
+        if not alive.any():
+            break
+        state = step_mdp(stepped)
+    return total
+
+
+class BestPolicy:
+    """Remembers the weights with the highest learned return on the same starts.
+
+    A policy takes the place of the best one if its mean return is higher by more than one standard
+    error of the paired difference, so that noise alone seldom replaces what phase 1 has learned.
+
+    >>> layer = nn.Linear(1, 1, bias=False)
+    >>> best = BestPolicy(layer)
+    >>> best.consider(torch.tensor([0.0, 1.0])), best.consider(torch.tensor([1.0, 0.0]))
+    (True, False)
+    >>> best.consider(torch.tensor([1.0, 1.5]))
+    True
+    """
+
+    def __init__(self, policy: nn.Module) -> None:
+        self.policy = policy
+        self.weights: dict[str, Tensor] = {}
+        self.returns: Tensor | None = None
+
+    def consider(self, returns: Tensor) -> bool:
+        """Keep the policy's present weights if their returns [N] are clearly higher."""
+        if self.returns is not None:
+            gain = returns - self.returns
+            error = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
+            if float(gain.mean()) <= STANDARD_ERRORS * error:
+                return False
+        self.returns = returns.clone()
+        self.weights = copy.deepcopy(self.policy.state_dict())
+        return True
+
+    def restore(self) -> None:
+        """Give the policy the best weights back, where there are any."""
+        if self.weights:
+            self.policy.load_state_dict(self.weights)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the best weights and their returns."""
+        return {"weights": self.weights, "returns": self.returns}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.weights, self.returns = state["weights"], state["returns"]

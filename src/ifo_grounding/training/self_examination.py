@@ -1,0 +1,367 @@
+"""Phase 2: improve a policy on chosen instructions under a learned reward (paper, Algorithm 1)."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
+from torchrl.objectives.value import GAE
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.seeding import derive
+from ifo_grounding.training.adversary import Adversary
+from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
+from ifo_grounding.training.selection import BestPolicy, learned_returns
+from ifo_grounding.training.supervised import Callback, Log, Metrics, make_optimizer, update
+
+ALGORITHMS = ("ppo", "reinforce")
+NAME = "self-examination"
+
+
+@dataclass(frozen=True)
+class SelfExaminationConfig:
+    """How the policy is improved."""
+
+    algorithm: str = "ppo"
+    """``ppo`` (clipped, several epochs) or ``reinforce`` (one epoch, as in the paper)."""
+    iterations: int = 30
+    """Rounds of collecting and updating."""
+    steps: int = 20
+    """Environment steps of each world per iteration."""
+    lr: float = 2e-4
+    """Learning rate of the policy (paper: 3e-5)."""
+    value_lr: float = 8e-4
+    """Learning rate of the value head."""
+    gamma: float = 0.99
+    """Discount; 0 credits each action with its own reward alone."""
+    lmbda: float = 0.95
+    """Trade-off of generalised advantage estimation."""
+    epochs: int = 3
+    """Passes over the collected steps, with ``ppo``."""
+    minibatch: int = 1024
+    """Steps per gradient step."""
+    clip: float = 0.2
+    """Clipping range of the probability ratio."""
+    entropy: float = 0.01
+    """Weight of the entropy bonus."""
+    kl: float = 0.0
+    """Reward that each nat away from the phase-1 policy costs."""
+    value_warmup: int = 2
+    """First iterations that train the value head alone."""
+    grad_clip: float = 1.0
+    """Largest norm of the gradient."""
+    select_every: int = 0
+    """Iterations between two looks at the greedy policy's learned return. In the end the best
+    policy is kept, which may be phase 1's; 0 keeps the last one."""
+    select_episodes: int = 512
+    """Episodes of each look, always from the same starts."""
+    max_steps: int = 40
+    """Most actions of an episode of such a look."""
+    evaluate_every: int = 0
+    """Iterations between two calls of the callback; 0 calls it at the end only."""
+    checkpoint_every: int = 1
+    """Iterations between two checkpoints."""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown algorithms and empty budgets."""
+        check_choice("algorithm", self.algorithm, ALGORITHMS)
+        for name in ("iterations", "steps", "epochs", "minibatch", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+def self_examine(
+    env: EnvBase,
+    policy: ProbabilisticTensorDictSequential,
+    value: TensorDictModuleBase,
+    config: SelfExaminationConfig,
+    *,
+    seed: int,
+    adversary: Adversary | None = None,
+    checkpoint: str | Path | None = None,
+    log: Log | None = None,
+    callback: Callback | None = None,
+    progress: bool = False,
+    settings: Any = None,
+) -> list[Metrics]:
+    """Improve ``policy`` in place by policy gradient on learned rewards.
+
+    Args:
+        env: batched, without true instructions and rewards; its transforms choose instructions
+            and write ``("next", "learned_reward")``.
+        policy: the phase-1 policy, a ``ProbabilisticActor``.
+        value: estimates the learned return.
+        config: algorithm and budget.
+        seed: all randomness is a function of it and of the iteration, and every iteration starts
+            from a reset: a run continues from its checkpoint to the same result.
+        adversary: trains the reward model on, with the steps of each iteration.
+        checkpoint: file to continue from and to save to.
+        log: gets the metrics of each iteration.
+        callback: gets the iteration, returns further metrics; the place for audits.
+        progress: whether to show a progress bar.
+        settings: what else decides the result; a checkpoint made with other settings is refused.
+
+    Returns:
+        Metrics of each iteration.
+
+    Raises:
+        UserError: where the env exposes its true state, or has no learned reward.
+    """
+    check_env(env)
+    policy.eval()
+    value.eval()
+    learner = _Learner(env, policy, value, config)
+    sampler_stats(env)  # forgets the reset that a collector begins with
+    selection = _Selection(env, policy, config, seed)
+    parts: dict[str, Any] = {
+        "loss": learner.loss,
+        "optimizer": learner.optimizer,
+        "best": selection.best,
+    }
+    if adversary:
+        parts["adversary"] = adversary
+    parts |= {
+        f"starts {place}": transform
+        for place, transform in enumerate(_transforms(env))
+        if getattr(transform, "fixes_scenes", False)
+    }
+    identity = fingerprint(config, seed, list(env.batch_size), settings)
+    saved = Checkpoint(checkpoint, identity, **parts) if checkpoint else None
+    state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
+    history: list[Metrics] = state["history"]
+    if not state["iteration"]:
+        selection.look(0)
+    from tqdm import tqdm
+
+    bar = tqdm(
+        total=config.iterations,
+        initial=state["iteration"],
+        desc=NAME,
+        disable=not progress,
+        leave=False,
+    )
+    with bar:
+        for iteration in range(state["iteration"], config.iterations):
+            reseed(env, derive(seed, NAME, iteration))
+            batch = learner.collect()
+            metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
+            metrics |= sampler_stats(env)
+            metrics |= learner.improve(batch, train_policy=iteration >= config.value_warmup)
+            if adversary:
+                metrics |= adversary(batch)
+            done = iteration + 1
+            metrics |= selection.look(done)
+            if done == config.iterations:
+                selection.best.restore()
+            due = config.evaluate_every and done % config.evaluate_every == 0
+            if callback and (due or done == config.iterations):
+                metrics |= callback(done)
+            history.append(metrics)
+            if log:
+                log(metrics, done)
+            if saved and (done % config.checkpoint_every == 0 or done == config.iterations):
+                saved.save({"iteration": done, "history": history})
+            bar.set_postfix(reward=f"{metrics['learned_return']:.3f}", refresh=False)
+            bar.update()
+    learner.close()
+    return history
+
+
+def check_env(env: EnvBase) -> None:
+    """Refuse an env that shows the true state or pays no learned reward."""
+    base = getattr(env, "base_env", env)
+    if getattr(base, "expose_state", False):
+        raise UserError("self-examination never sees the true state: use expose_state=False")
+    observed = env.observation_spec.keys(True, True)
+    if keys.INSTRUCTION not in observed:
+        raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
+    written = [*env.full_reward_spec.keys(True, True), *observed]
+    if keys.LEARNED_REWARD not in written:
+        raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
+
+
+def reseed(env: EnvBase, seed: int) -> None:
+    """Seed torch, the simulator and every transform that draws; fixed starts keep their scenes."""
+    torch.manual_seed(seed)
+    transforms = _transforms(env)
+    for place, transform in enumerate(transforms):
+        if callable(set_seed := getattr(transform, "set_seed", None)):
+            set_seed(derive(seed, "transform", place) % 2**31)
+    if not any(getattr(transform, "fixes_scenes", False) for transform in transforms):
+        env.set_seed(derive(seed, "simulator") % 2**31)
+
+
+def sampler_stats(env: EnvBase) -> Metrics:
+    """Return what the transforms counted since the last call."""
+    found: Metrics = {}
+    for transform in _transforms(env):
+        if callable(stats := getattr(transform, "stats", None)):
+            found |= {key: float(value) for key, value in stats().items()}
+    return found
+
+
+def summary(batch: TensorDictBase) -> Metrics:
+    """Describe collected steps [N, T] by what the learner can see."""
+    done = batch[keys.NEXT, "done"]
+    stopped = batch[keys.NEXT, "terminated"]
+    reward = batch[keys.NEXT, keys.LEARNED_REWARD]
+    episodes = done.sum().clamp(min=1)
+    return {
+        "frames": float(batch.numel()),
+        "learned_reward": float(reward.mean()),
+        "learned_return": float(reward.sum() / episodes),
+        "episode_length": float(batch.numel() / episodes),
+        "stopped": float(stopped.sum() / episodes),
+    }
+
+
+class _Selection:
+    """Looks at the policy's learned return from time to time, always from the same starts."""
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: ProbabilisticTensorDictSequential,
+        config: SelfExaminationConfig,
+        seed: int,
+    ) -> None:
+        self.env, self.policy, self.config, self.seed = env, policy, config, seed
+        self.best = BestPolicy(policy)
+        self.fixed = [t for t in _transforms(env) if getattr(t, "fixes_scenes", False)]
+        self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
+
+    def look(self, done: int) -> Metrics:
+        """Measure and consider the policy after some iterations, if it is time to."""
+        config = self.config
+        if not config.select_every or (done % config.select_every and done != config.iterations):
+            return {}
+        present = copy.deepcopy([starts.state_dict() for starts in self.fixed])
+        for starts, first in zip(self.fixed, self.first_starts, strict=True):
+            starts.load_state_dict(copy.deepcopy(first))
+        reseed(self.env, derive(self.seed, NAME, "selection"))
+        returns = learned_returns(self.env, self.policy, config.select_episodes, config.max_steps)
+        sampler_stats(self.env)
+        for starts, last in zip(self.fixed, present, strict=True):
+            starts.load_state_dict(last)
+        kept = self.best.consider(returns)
+        return {"selection_return": float(returns.mean()), "selected": float(kept)}
+
+
+class _Learner:
+    """Holds the losses, the optimizer and the collector of one run."""
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: ProbabilisticTensorDictSequential,
+        value: TensorDictModuleBase,
+        config: SelfExaminationConfig,
+    ) -> None:
+        self.config, self.policy = config, policy
+        self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl else None
+        self.collector = Collector(
+            env,
+            policy,
+            frames_per_batch=env.batch_size.numel() * config.steps,
+            total_frames=-1,
+            reset_at_each_iter=True,
+            trust_policy=True,
+            auto_register_policy_transforms=False,
+        )
+        self.batches: Iterator[TensorDictBase] | None = None
+        self.advantage = GAE(
+            gamma=config.gamma, lmbda=config.lmbda, value_network=value, deactivate_vmap=True
+        )
+        self.advantage.set_keys(reward=keys.LEARNED_REWARD)
+        self.loss = _make_loss(policy, value, config)
+        critic = {id(p) for p in value.parameters()}
+        self.optimizer = make_optimizer(
+            (p for p in policy.parameters() if id(p) not in critic), 1.0
+        )
+        self.optimizer.param_groups[0]["lr"] = config.lr
+        self.optimizer.add_param_group({"params": list(value.parameters()), "lr": config.value_lr})
+
+    def collect(self) -> TensorDictBase:
+        """Roll out the policy from a reset, [N, T], without whatever the simulator judged."""
+        if self.batches is None:
+            self.batches = iter(self.collector)
+        batch = next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
+        if self.reference is not None:
+            self._charge_divergence(batch)
+        return batch
+
+    @torch.no_grad()
+    def _charge_divergence(self, batch: TensorDictBase) -> None:
+        steps = batch.reshape(-1)
+        parts = steps.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION).split(4096)
+        assert self.reference is not None
+        reference = torch.cat([_log_prob(self.reference, part) for part in parts])
+        current = torch.cat([_log_prob(self.policy, part) for part in parts])
+        charge = self.config.kl * (current - reference).reshape(*batch.shape, 1)
+        reward = batch[keys.NEXT, keys.LEARNED_REWARD]
+        batch[keys.NEXT, keys.LEARNED_REWARD] = reward - charge
+
+    def improve(self, batch: TensorDictBase, train_policy: bool) -> Metrics:
+        """Update policy and value on collected steps."""
+        config = self.config
+        with torch.no_grad():
+            self.advantage(batch)
+        self.optimizer.param_groups[0]["lr"] = config.lr if train_policy else 0.0
+        steps = batch.reshape(-1)
+        epochs = config.epochs if config.algorithm == "ppo" else 1
+        sums: dict[str, Tensor] = {}
+        updates = 0
+        for _ in range(epochs):
+            for rows in torch.randperm(len(steps)).split(config.minibatch):
+                losses = self.loss(steps[rows])
+                for key, scalar in update(losses, self.optimizer, config.grad_clip).items():
+                    sums[key] = sums.get(key, torch.zeros(())) + scalar.cpu()
+                updates += 1
+        return {key: float(total) / updates for key, total in sums.items()}
+
+    def close(self) -> None:
+        """Let go of the collector, and leave the env open for its owner."""
+        self.collector.shutdown(close_env=False)
+
+
+def _make_loss(
+    policy: ProbabilisticTensorDictSequential,
+    value: TensorDictModuleBase,
+    config: SelfExaminationConfig,
+) -> LossModule:
+    loss: LossModule
+    if config.algorithm == "ppo":
+        loss = ClipPPOLoss(
+            policy,
+            value,
+            clip_epsilon=config.clip,
+            entropy_bonus=config.entropy > 0,
+            entropy_coeff=config.entropy,
+            normalize_advantage=True,
+        )
+    else:
+        loss = ReinforceLoss(policy, value)
+    loss.set_keys(reward=keys.LEARNED_REWARD)
+    return loss
+
+
+def _log_prob(policy: ProbabilisticTensorDictSequential, steps: TensorDictBase) -> Tensor:
+    return policy.get_dist(steps.copy()).log_prob(steps[keys.ACTION])
+
+
+def _transforms(env: EnvBase) -> list[nn.Module]:
+    transform = getattr(env, "transform", None)
+    if transform is None:
+        return []
+    return list(transform) if hasattr(transform, "transforms") else [transform]

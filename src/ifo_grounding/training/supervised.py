@@ -1,0 +1,194 @@
+"""One loop for everything that learns from a replay buffer."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import derive
+from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
+
+Metrics = dict[str, float]
+Callback = Callable[[int], Metrics]
+Log = Callable[[Metrics, int], None]
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How long and how fast to learn."""
+
+    steps: int = 2000
+    """Gradient steps."""
+    batch_size: int = 512
+    """Samples per step."""
+    lr: float = 8e-4
+    """Peak learning rate (paper: 8e-4)."""
+    schedule: str = "cosine"
+    """``constant``, or ``cosine``: a short warm-up, then down to zero."""
+    warmup: float = 0.02
+    """Share of the steps that warm up, with ``cosine``."""
+    weight_decay: float = 0.0
+    """Decoupled weight decay; 0 makes AdamW the paper's Adam."""
+    grad_clip: float = 1.0
+    """Largest norm of the gradient."""
+    iteration: int = 50
+    """Steps between two points where a killed run can continue."""
+    evaluate_every: int = 0
+    """Iterations between two calls of the callback; 0 calls it at the end only."""
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that cannot be."""
+        for name in ("steps", "batch_size", "iteration"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.schedule not in ("constant", "cosine"):
+            raise UserError(f"unknown schedule {self.schedule!r}: choose constant or cosine")
+
+    def rate(self, step: int) -> float:
+        """Return the share of the peak learning rate at a step."""
+        if self.schedule == "constant":
+            return 1.0
+        warmup = max(1, round(self.warmup * self.steps))
+        if step < warmup:
+            return (step + 1) / warmup
+        return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, self.steps - warmup)))
+
+
+def make_optimizer(
+    parameters: Iterable[nn.Parameter], lr: float, weight_decay: float = 0.0
+) -> torch.optim.Optimizer:
+    """Return AdamW in its fused form."""
+    trained = [parameter for parameter in parameters if parameter.requires_grad]
+    return torch.optim.AdamW(trained, lr=lr, weight_decay=weight_decay, fused=True)
+
+
+def total_loss(losses: TensorDictBase) -> Tensor:
+    """Add up all entries named ``loss_*``."""
+    return torch.stack(
+        [value.mean() for key, value in losses.items() if str(key).startswith("loss_")]
+    ).sum()
+
+
+def update(
+    losses: TensorDictBase, optimizer: torch.optim.Optimizer, grad_clip: float
+) -> dict[str, Tensor]:
+    """Make one gradient step and return what the losses and metrics were."""
+    optimizer.zero_grad(set_to_none=True)
+    total_loss(losses).backward()
+    trained = [p for group in optimizer.param_groups for p in group["params"]]
+    norm = nn.utils.clip_grad_norm_(trained, grad_clip)
+    optimizer.step()
+    scalars = {str(key): value.detach().float().mean() for key, value in losses.items()}
+    return {**scalars, "grad_norm": norm.detach()}
+
+
+def fit(
+    loss: nn.Module,
+    buffer: ReplayBuffer,
+    config: FitConfig,
+    *,
+    seed: int,
+    name: str = "fit",
+    checkpoint: str | Path | None = None,
+    checkpoint_seconds: float = 15.0,
+    log: Log | None = None,
+    callback: Callback | None = None,
+    progress: bool = False,
+    settings: Any = None,
+) -> list[Metrics]:
+    """Minimise a loss module over samples of a replay buffer.
+
+    Args:
+        loss: a LossModule; entries of its output named ``loss_*`` are minimised, others are
+            metrics. Where it has ``set_progress``, it is told the share of steps done.
+        buffer: ``sample(batch_size)`` gives the loss its input.
+        config: steps, batch size, learning rate.
+        seed: all randomness is a function of it, of ``name`` and of the iteration.
+        name: names the stream of randomness, and the progress bar.
+        checkpoint: file to continue from and to save to.
+        checkpoint_seconds: least time between two checkpoints.
+        log: gets the mean metrics of each iteration and the step.
+        callback: gets the step, returns further metrics.
+        progress: whether to show a progress bar.
+        settings: what else decides the result; a checkpoint made with other settings is refused.
+
+    Returns:
+        Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
+    """
+    optimizer = make_optimizer(loss.parameters(), config.lr, config.weight_decay)
+    saved = _saved(checkpoint, fingerprint(config, seed, name, settings), loss, optimizer)
+    state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
+    history: list[Metrics] = state["history"]
+    iterations = math.ceil(config.steps / config.iteration)
+    last_save = time.monotonic()
+    with _bar(iterations, state["iteration"], name, progress) as bar:
+        for iteration in range(state["iteration"], iterations):
+            torch.manual_seed(derive(seed, name, iteration))
+            first = iteration * config.iteration
+            steps = range(first, min(first + config.iteration, config.steps))
+            metrics = _iterate(loss, buffer, optimizer, config, steps)
+            done = iteration + 1
+            due = config.evaluate_every and done % config.evaluate_every == 0
+            if callback and (due or done == iterations):
+                metrics |= callback(steps.stop)
+            history.append(metrics)
+            if log:
+                log(metrics, steps.stop)
+            bar.set_postfix(_brief(metrics), refresh=False)
+            bar.update()
+            pause = time.monotonic() - last_save
+            if saved and (pause > checkpoint_seconds or done == iterations):
+                saved.save({"iteration": done, "history": history})
+                last_save = time.monotonic()
+    return history
+
+
+def _iterate(
+    loss: nn.Module,
+    buffer: ReplayBuffer,
+    optimizer: torch.optim.Optimizer,
+    config: FitConfig,
+    steps: range,
+) -> Metrics:
+    sums: dict[str, Tensor] = defaultdict(lambda: torch.zeros(()))
+    start = time.perf_counter()
+    for step in steps:
+        if callable(set_progress := getattr(loss, "set_progress", None)):
+            set_progress(step / config.steps)
+        for group in optimizer.param_groups:
+            group["lr"] = config.lr * config.rate(step)
+        batch = buffer.sample(config.batch_size)
+        for key, value in update(loss(batch), optimizer, config.grad_clip).items():
+            sums[key] = sums[key] + value.cpu()
+    elapsed = time.perf_counter() - start
+    means = {key: float(value) / len(steps) for key, value in sums.items()}
+    speed = len(steps) * config.batch_size / elapsed
+    return {"step": float(steps.stop), **means, "samples_per_second": speed}
+
+
+def _saved(
+    path: str | Path | None, settings: str, loss: nn.Module, optimizer: torch.optim.Optimizer
+) -> Checkpoint | None:
+    return Checkpoint(path, settings, loss=loss, optimizer=optimizer) if path else None
+
+
+def _bar(total: int, initial: int, name: str, progress: bool) -> Any:
+    from tqdm import tqdm
+
+    return tqdm(total=total, initial=initial, desc=name, disable=not progress, leave=False)
+
+
+def _brief(metrics: Metrics) -> dict[str, str]:
+    shown = [key for key in metrics if key.startswith(("loss", "accuracy", "success"))]
+    return {key.removeprefix("loss_"): f"{metrics[key]:.3f}" for key in shown[:3]}

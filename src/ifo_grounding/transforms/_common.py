@@ -1,0 +1,189 @@
+"""What the transforms share: reset masks, judges in eval mode, keys of a judge."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+from ifo_grounding.errors import UserError
+
+
+class EpisodeTransform(Transform):
+    """A transform that acts where episodes begin and leaves the mode of its judge alone.
+
+    ``env.eval()`` and ``env.train()`` reach every transform. A judge may be in training elsewhere
+    at that moment, so its mode is changed only while it scores.
+    """
+
+    def train(self, mode: bool = True) -> EpisodeTransform:
+        """Set the transform's own mode; not that of the modules it holds."""
+        self.training = mode
+        return self
+
+    @property
+    def reset_key(self) -> NestedKey:
+        """Key of the mask of rows that begin an episode."""
+        names = ["_reset"] if self.parent is None else self.parent.reset_keys
+        if len(names) == 1:
+            return names[0]
+        if "_reset" in names:
+            return "_reset"
+        raise UserError(
+            f"{type(self).__name__} needs one done entry for the whole environment, found "
+            f"{len(names)}: {names}"
+        )
+
+    def beginning(self, tensordict: TensorDictBase | None, rows: int) -> Tensor:
+        """Numbers of the rows that begin an episode, int64 [R], of ``rows`` rows."""
+        mask = None if tensordict is None else tensordict.get(self.reset_key, None)
+        if mask is None:
+            return torch.arange(rows)
+        return mask.reshape(rows, -1).any(-1).nonzero().squeeze(-1)
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._reset(tensordict, tensordict_reset)
+
+
+class InstructionTransform(EpisodeTransform):
+    """A transform that writes an instruction at the reset and carries it to the episode's end.
+
+    Subclasses set ``vocabulary_size``, and write ``out_keys[0]`` in ``_reset``.
+    """
+
+    vocabulary_size: int | None
+
+    @property
+    def tokens(self) -> Tensor:
+        """All instructions that may be written, int64 [N, L]."""
+        raise NotImplementedError
+
+    def check_env(self, env: EnvBase) -> None:
+        """Raise :class:`UserError` where the innermost environment does not suit."""
+        if isinstance(env, BatchedEnvBase):
+            # Entries that workers' transforms carry are no true state.
+            exposed = env._supports_set_state
+        else:
+            shown = getattr(env, "expose_state", False)
+            exposed = shown or not env.state_spec.is_empty(recurse=True)
+        if exposed:
+            raise UserError(
+                f"{type(self).__name__} refuses an environment that exposes its true state: a "
+                "learner must not see it. Make the environment with expose_state=False"
+            )
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        instruction = tensordict.get(self.out_keys[0], None)
+        if instruction is None:
+            raise UserError(f"no {self.out_keys[0]!r} to carry: step from what reset() returned")
+        return next_tensordict.set(self.out_keys[0], instruction)
+
+    def _spec(self, like: Composite) -> Bounded:
+        size, env, largest = self.vocabulary_size, base_of(self), int(self.tokens.max())
+        if size is None and env is not None and not isinstance(env, BatchedEnvBase):
+            size = getattr(env, "vocabulary_size", None)
+        if size is not None and largest >= size:
+            raise UserError(
+                f"there is a token id {largest}, but the vocabulary has {size} ids: pass the "
+                "vocabulary_size that made the instructions"
+            )
+        return Bounded(
+            0,
+            largest if size is None else size - 1,
+            shape=(*like.shape, self.tokens.shape[1]),
+            dtype=torch.int64,
+            device=like.device,
+        )
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Declare the instruction.
+
+        Raises:
+            UserError: where the environment does not suit or has an instruction already.
+        """
+        if (env := base_of(self)) is not None:
+            self.check_env(env)
+        key = self.out_keys[0]
+        if key in observation_spec.keys(True, True):
+            raise UserError(
+                f"the environment already writes {key!r}: make it with instructed=False, or write "
+                "to another key"
+            )
+        observation_spec[key] = self._spec(observation_spec)
+        return observation_spec
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        """Declare that a step reads the instruction (batched environments send it to workers)."""
+        state_spec[self.out_keys[0]] = self._spec(state_spec)
+        return state_spec
+
+
+def base_of(transform: Transform) -> EnvBase | None:
+    """Innermost environment around a transform, None where there is none."""
+    env = transform.container
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+@contextlib.contextmanager
+def judging(module: nn.Module) -> Iterator[None]:
+    """Run a block without gradients and with ``module`` in eval mode; restore every mode after."""
+    training = [part for part in module.modules() if part.training]
+    try:
+        if training:
+            module.eval()
+        with torch.no_grad():
+            yield
+    finally:
+        for part in training:
+            part.training = True
+
+
+def device_of(module: nn.Module) -> torch.device | None:
+    """Device of the first parameter or buffer, None where there is none."""
+    for tensor in (*module.parameters(), *module.buffers()):
+        return tensor.device
+    return None
+
+
+def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:
+    """Key under which a TensorDictModule writes its logit.
+
+    Raises:
+        UserError: where ``judge`` is no TensorDictModule, or it is unclear which output is meant.
+    """
+    if not isinstance(judge, TensorDictModuleBase):
+        raise UserError(
+            f"expected a TensorDictModule that writes {expected!r}, got {type(judge).__name__}"
+        )
+    names = [unravel_key(key) for key in judge.out_keys]
+    for name in names:
+        if name == expected or (isinstance(name, tuple) and name[-1] == expected):
+            return name
+    if len(names) != 1:
+        raise UserError(f"the module writes {names}: one of them must be named {expected!r}")
+    return names[0]
+
+
+def flat_logit(logit: Tensor, rows: int, name: NestedKey) -> Tensor:
+    """Check a judge's output and return it as [rows].
+
+    Raises:
+        UserError: where its shape is not [rows, 1] or it is not a number.
+    """
+    if logit.numel() != rows:
+        raise UserError(f"{name!r} must have shape [{rows}, 1], got {list(logit.shape)}")
+    if logit.isnan().any():
+        raise UserError(f"{name!r} is not a number: its network diverged or was loaded wrong")
+    return logit.reshape(rows).float()

@@ -1,0 +1,251 @@
+"""Choosing instructions of a pool for states (paper, "Instruction Module")."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, Protocol, cast
+
+import torch
+from tensordict import TensorDict, unravel_key
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.keys import PIXELS, SUITABILITY
+from ifo_grounding.transforms._common import device_of, flat_logit, judging, logit_key
+
+CHOICES = ("random", "best")
+AT_ONCE = 2048
+"""States, instructions or pairs that pass a network together, to bound memory."""
+FIRST_LOOK = 4
+"""Candidates of each state that are scored first; then twice as many, and so on."""
+
+
+class Choices(NamedTuple):
+    """An instruction for each state, or none."""
+
+    chosen: Tensor
+    """Index into the pool, int64 [B]; -1 where no candidate was above the threshold."""
+    score: Tensor
+    """Its probability of being suitable, float32 [B]; the best one seen where there is none."""
+
+
+class SplitClassifier(Protocol):
+    """A classifier that encodes states and instructions separately."""
+
+    def encode_pixels(self, pixels: Tensor) -> Tensor: ...  # noqa: D102
+
+    def encode_instruction(self, instruction: Tensor) -> Tensor: ...  # noqa: D102
+
+    def score(self, pixels: Tensor, instruction: Tensor) -> Tensor: ...  # noqa: D102
+
+
+class PoolScorer:
+    """Scores pairs of a state and an instruction of a pool.
+
+    Where the classifier's network has ``encode_pixels``, ``encode_instruction`` and ``score``, each
+    state and each instruction is encoded once: encodings of the pool are kept until a weight
+    changes. Any other TensorDictModule is called on whole pairs.
+
+    Args:
+        classifier: TensorDictModule from (pixels, instruction) to one logit.
+        pool: token ids, int64 [N, L].
+        pixels_key: key of the images where the classifier's inputs are in another order.
+
+    Raises:
+        UserError: on a classifier or a pool of another form.
+    """
+
+    def __init__(
+        self, classifier: TensorDictModuleBase, pool: Tensor, pixels_key: NestedKey = PIXELS
+    ) -> None:
+        self.logit_key = logit_key(classifier, SUITABILITY)
+        inputs = [unravel_key(key) for key in classifier.in_keys]
+        if len(inputs) != 2:
+            raise UserError(f"a classifier reads pixels and an instruction, not {inputs}")
+        swapped = inputs[1] in (pixels_key, PIXELS) and inputs[0] not in (pixels_key, PIXELS)
+        self.pixels_key, self.instruction_key = reversed(inputs) if swapped else inputs
+        self.classifier = classifier
+        self.pool = check_pool(pool)
+        self.scored = 0
+        self._encodings: Tensor | None = None
+        self._weights: list[Tensor] = []
+
+    @property
+    def network(self) -> SplitClassifier | None:
+        """The classifier's network where it encodes states and instructions separately."""
+        if not isinstance(self.classifier, TensorDictModule):
+            return None
+        network = self.classifier.module
+        parts = ("encode_pixels", "encode_instruction", "score")
+        split = all(callable(getattr(network, part, None)) for part in parts)
+        return cast(SplitClassifier, network) if split else None
+
+    def encode(self, pixels: Tensor) -> Tensor:
+        """Encode states [B, ...] for :meth:`score`, or return them where nothing is split."""
+        if (network := self.network) is None:
+            return pixels
+        device = device_of(self.classifier) or pixels.device
+        with judging(self.classifier):
+            return torch.cat([network.encode_pixels(p.to(device)) for p in pixels.split(AT_ONCE)])
+
+    def score(self, states: Tensor, index: Tensor) -> Tensor:
+        """Score candidates.
+
+        Args:
+            states: encoded states [B, ...], from :meth:`encode`.
+            index: candidates of each state in the pool, int64 [B, K].
+
+        Returns:
+            Logits, float32 [B, K] on the device of ``index``.
+        """
+        self.scored += index.numel()
+        device = device_of(self.classifier) or states.device
+        rows = max(1, AT_ONCE // max(1, index.shape[1]))
+        with judging(self.classifier):
+            parts = [
+                self._pairs(some.to(device), candidates.to(device))
+                for some, candidates in zip(states.split(rows), index.split(rows), strict=True)
+            ]
+        return torch.cat(parts).to(index.device)
+
+    def _pairs(self, states: Tensor, index: Tensor) -> Tensor:
+        rows, candidates = index.shape
+        paired = states.repeat_interleave(candidates, 0)
+        if (network := self.network) is not None:
+            logit = network.score(paired, self.encodings(network, states.device)[index.flatten()])
+        else:
+            batch = TensorDict({}, batch_size=[len(paired)], device=states.device)
+            batch[self.pixels_key] = paired
+            batch[self.instruction_key] = self.pool.to(states.device)[index.flatten()]
+            logit = self.classifier(batch).get(self.logit_key)
+        return flat_logit(logit, len(paired), self.logit_key).view(rows, candidates)
+
+    def encodings(self, network: SplitClassifier, device: torch.device) -> Tensor:
+        """Encode the pool, or return what was kept if no weight has changed since."""
+        weights = [*self.classifier.parameters(), *self.classifier.buffers()]
+        # Values are compared, not version counters: updates through `.data` or from another
+        # process do not count.
+        fresh = len(weights) == len(self._weights) and all(
+            now.device == kept.device and torch.equal(now, kept)
+            for now, kept in zip(weights, self._weights, strict=True)
+        )
+        if self._encodings is None or not fresh or self._encodings.device != device:
+            self._weights = [weight.detach().clone() for weight in weights]
+            chunks = self.pool.to(device).split(AT_ONCE)
+            self._encodings = torch.cat([network.encode_instruction(chunk) for chunk in chunks])
+        return self._encodings
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the encodings behind: a copy makes its own."""
+        return {**self.__dict__, "_encodings": None, "_weights": []}
+
+
+def check_pool(pool: Tensor) -> Tensor:
+    """Return ``pool`` if it is int64 [N, L] with N > 0, else raise :class:`UserError`."""
+    if not isinstance(pool, Tensor) or pool.ndim != 2 or pool.is_floating_point():
+        got = f"{pool.dtype} {list(pool.shape)}" if isinstance(pool, Tensor) else type(pool)
+        raise UserError(f"pool must be token ids, int64 [N, L], got {got}")
+    if not len(pool):
+        raise UserError("pool is empty: pass at least one instruction")
+    return pool.to(torch.int64)
+
+
+def check_options(threshold: float, candidates: int, choose: str) -> None:
+    """Raise :class:`UserError` where an option of the choice is impossible."""
+    check_choice("choose", choose, CHOICES)
+    if not 0 <= threshold < 1:
+        raise UserError(f"threshold is a probability in [0, 1), got {threshold}")
+    if candidates < 1:
+        raise UserError(f"candidates must be at least 1, got {candidates}")
+
+
+def draw_candidates(
+    states: int, pool_size: int, candidates: int, generator: torch.Generator | None
+) -> Tensor:
+    """Draw distinct candidates for each state, in random order, int64 [states, K].
+
+    K is ``candidates``, or ``pool_size`` if that is smaller.
+    """
+    lots = torch.rand(states, pool_size, generator=generator)
+    return lots.topk(min(candidates, pool_size), dim=1).indices
+
+
+def choose_instructions(
+    classifier: TensorDictModuleBase | PoolScorer,
+    pool: Tensor | None,
+    pixels: Tensor,
+    *,
+    threshold: float = 0.8,
+    candidates: int = 64,
+    choose: str = "random",
+    generator: torch.Generator | None = None,
+) -> Choices:
+    """Choose a suitable instruction of a pool for each state (paper, "Instruction Module").
+
+    Args:
+        classifier: TensorDictModule from (pixels, instruction) to the logit of suitability, or a
+            :class:`PoolScorer`, which remembers the pool and its encodings.
+        pool: token ids, int64 [N, L]; None with a :class:`PoolScorer`.
+        pixels: states, uint8 [B, 3, H, W].
+        threshold: least probability of a suitable pair; 0.8 in the paper.
+        candidates: instructions drawn for each state; the whole pool if it is smaller.
+        choose: ``random`` among the suitable candidates, or the ``best`` of them.
+        generator: source of randomness, on the CPU.
+
+    Returns:
+        Index into the pool, int64 [B], -1 where none was suitable, and its probability [B].
+
+    Raises:
+        UserError: on impossible options, or a classifier or pool of another form.
+
+    >>> from tensordict.nn import TensorDictModule, TensorDictModuleBase
+    >>> def same(pixels, instruction):  # suitable where the first token is the brightness
+    ...     equal = pixels.flatten(1)[:, :1] == instruction[:, :1]
+    ...     return equal * 8.0 - 4.0
+    >>> classifier = TensorDictModule(same, ["pixels", "instruction"], ["suitability"])
+    >>> pixels = torch.tensor([3, 7, 1], dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 8, 8)
+    >>> choose_instructions(classifier, torch.tensor([[1], [2], [3]]), pixels).chosen.tolist()
+    [2, -1, 0]
+    """
+    check_options(threshold, candidates, choose)
+    if isinstance(classifier, PoolScorer):
+        scorer = classifier
+    else:
+        if pool is None:
+            raise UserError("choose_instructions needs a pool of instructions")
+        scorer = PoolScorer(classifier, pool)
+    index = draw_candidates(len(pixels), len(scorer.pool), candidates, generator)
+    index = index.to(pixels.device)
+    limit = math.log(threshold / (1 - threshold)) if threshold else -math.inf
+    return _search(scorer, pixels, index, limit, best=choose == "best")
+
+
+def _search(scorer: PoolScorer, pixels: Tensor, index: Tensor, limit: float, best: bool) -> Choices:
+    """Look at the candidates of each state in growing parts until one holds a suitable candidate.
+
+    The first suitable candidate of a random order is a random suitable one, so that most
+    candidates need no score. The best one is known when all are scored.
+    """
+    look = index.shape[1] if best else FIRST_LOOK
+    chosen = torch.full((len(pixels),), -1, dtype=torch.int64, device=pixels.device)
+    score = torch.full((len(pixels),), -math.inf, device=pixels.device)
+    waiting = torch.arange(len(pixels), device=pixels.device)
+    states = scorer.encode(pixels) if len(pixels) else pixels
+    begin = 0
+    while len(waiting) and begin < index.shape[1]:
+        candidates = index[waiting, begin : begin + look]
+        logits = scorer.score(states[waiting.to(states.device)], candidates)
+        suitable = logits > limit
+        found = suitable.any(1)
+        place = logits.argmax(1)
+        if not best:
+            place = torch.where(found, suitable.int().argmax(1), place)
+        logit = logits.gather(1, place.unsqueeze(1)).squeeze(1)
+        picked = candidates.gather(1, place.unsqueeze(1)).squeeze(1)
+        chosen[waiting] = torch.where(found, picked, -1)
+        score[waiting] = torch.where(found, logit, torch.maximum(logit, score[waiting]))
+        waiting = waiting[~found]
+        begin, look = begin + look, 2 * look
+    return Choices(chosen, score.sigmoid())

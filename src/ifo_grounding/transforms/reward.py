@@ -1,0 +1,248 @@
+"""A reward from learned judges, beside the true one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.keys import (
+    ACTION,
+    ACTION_SCORE,
+    GOAL_SCORE,
+    INITIAL_PIXELS,
+    LEARNED_REWARD,
+    NEXT,
+    PIXELS,
+    STOP,
+)
+from ifo_grounding.transforms._common import (
+    EpisodeTransform,
+    device_of,
+    flat_logit,
+    judging,
+    logit_key,
+)
+
+KINDS = ("action", "goal", "both")
+FORMS = ("probability", "centred", "log-odds")
+ROWS_AT_ONCE = 4096
+"""Rows that a judge scores together, to bound memory."""
+
+
+class LearnedReward(EpisodeTransform):
+    """Pays every step what a learned judge thinks of it; the true reward stays where it is.
+
+    ``kind="action"`` is the paper's reward module ``rwd(s, t, a)``: the probability that the action
+    is right for the state and the instruction. ``kind="goal"`` is an extension: a judge of (first
+    frame, last frame, instruction) pays its probability when the policy stops, and nothing before.
+    It assumes that demonstrations end in success. ``kind="both"`` adds the two, weighted.
+
+    Used on an environment it writes ``("next", "learned_reward")`` after every step; called on a
+    tensordict, or appended to a replay buffer, it relabels steps that were collected before. The
+    judges move with the environment's device; their mode (train or eval) is left as it is.
+
+    Args:
+        model: TensorDictModule that writes a logit: the judge of actions, or that of goals where
+            ``kind="goal"``. Its ``in_keys`` are read.
+        kind: ``action``, ``goal`` or ``both``.
+        reward_key: key of the reward, below ``next``.
+        form: of the action's reward: ``probability`` p (paper), ``centred`` p - 0.5, or
+            ``log-odds`` log(p / (1 - p)).
+        goal_model: the judge of goals where ``kind="both"``.
+        weights: of the action's and of the goal's reward.
+        stop_action: the action that ends an episode by the policy's will; None pays the goal where
+            ``("next", "terminated")`` is true instead.
+        pixels_key: key of the image, which the judge of goals is shown as it is after the step.
+        initial_pixels_key: key of the first image of the episode, which the transform carries.
+        action_key: key of the action.
+
+    Raises:
+        UserError: on an unknown kind or form, or a judge of another form.
+
+    >>> from tensordict.nn import TensorDictModule
+    >>> model = TensorDictModule(lambda action: (action * 0.0).unsqueeze(-1), ["action"],
+    ...                          ["action_score"])
+    >>> batch = TensorDict({"action": torch.tensor([0, 3])}, [2])
+    >>> LearnedReward(model)(batch)["next", "learned_reward"].tolist()
+    [[0.5], [0.5]]
+    """
+
+    def __init__(
+        self,
+        model: TensorDictModuleBase,
+        kind: str = "action",
+        reward_key: NestedKey = LEARNED_REWARD,
+        form: str = "probability",
+        goal_model: TensorDictModuleBase | None = None,
+        weights: Sequence[float] = (1.0, 1.0),
+        stop_action: int | None = STOP,
+        pixels_key: NestedKey = PIXELS,
+        initial_pixels_key: NestedKey = INITIAL_PIXELS,
+        action_key: NestedKey = ACTION,
+    ) -> None:
+        check_choice("kind", kind, KINDS)
+        check_choice("form", form, FORMS)
+        if (goal_model is None) == (kind == "both"):
+            raise UserError("goal_model is for kind='both', which needs it as its second judge")
+        if kind == "goal" and form != "probability":
+            raise UserError(f"form={form!r} is for the action's reward: a goal pays a probability")
+        if len(weights) != 2:
+            raise UserError(f"weights are two, of the action and of the goal, got {len(weights)}")
+        self.kind, self.form, self.stop_action = kind, form, stop_action
+        self.action_weight, self.goal_weight = (float(weight) for weight in weights)
+        action_judge = None if kind == "goal" else model
+        goal_judge = model if kind == "goal" else goal_model
+        self.pixels_key = unravel_key(pixels_key)
+        self.initial_pixels_key = unravel_key(initial_pixels_key)
+        self.action_key = unravel_key(action_key)
+        self.reward_key = unravel_key(reward_key)
+        inputs: list[NestedKey] = []
+        if action_judge is not None:
+            self.action_logit = logit_key(action_judge, ACTION_SCORE)
+            inputs += [unravel_key(key) for key in action_judge.in_keys]
+        if goal_judge is not None:
+            self.goal_logit = logit_key(goal_judge, GOAL_SCORE)
+            inputs += [unravel_key(key) for key in goal_judge.in_keys]
+        super().__init__(in_keys=list(dict.fromkeys(inputs)), out_keys=[self.reward_key])
+        self.action_judge, self.goal_judge = action_judge, goal_judge
+
+    @property
+    def judges_goals(self) -> bool:
+        """Whether the first image of the episode is carried along."""
+        return self.goal_judge is not None
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Rows that do not begin keep what they had: the environment merges by its mask.
+        if self.judges_goals:
+            first = tensordict_reset.get(self.pixels_key)
+            tensordict_reset.set(self.initial_pixels_key, first.clone())
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self.judges_goals:
+            first = tensordict.get(self.initial_pixels_key)
+            next_tensordict.set(self.initial_pixels_key, first)
+        return next_tensordict.set(self.reward_key, self._pay(tensordict, next_tensordict))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Relabel collected steps, a tensordict [*B], with ``("next", "learned_reward")``.
+
+        Raises:
+            UserError: where an entry that a judge reads is missing.
+        """
+        if tensordict.get(NEXT, None) is None:
+            tensordict.set(NEXT, tensordict.empty())
+        after = tensordict.get(NEXT)
+        after.set(self.reward_key, self._pay(tensordict, after))
+        return tensordict
+
+    def _pay(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
+        """Reward of steps, float32 [*B, 1]."""
+        batch = before.batch_size
+        rows = batch.numel()
+        reward: Tensor | float = 0.0
+        if self.action_judge is not None:
+            entries = {key: self._rows(before, key) for key in self.action_judge.in_keys}
+            logit = self._score(self.action_judge, self.action_logit, entries, rows)
+            reward = reward + self.action_weight * formed(logit, self.form)
+        if self.goal_judge is not None:
+            reward = reward + self.goal_weight * self._goal_reward(before, after, rows)
+        assert isinstance(reward, Tensor)
+        return reward.view(*batch, 1)
+
+    def _goal_reward(self, before: TensorDictBase, after: TensorDictBase, rows: int) -> Tensor:
+        assert self.goal_judge is not None
+        stopped = self._stopped(before, after, rows).nonzero().squeeze(-1)
+        entries = {
+            key: self._rows(after if unravel_key(key) == self.pixels_key else before, key)[stopped]
+            for key in self.goal_judge.in_keys
+        }
+        reward = torch.zeros(rows, device=stopped.device)
+        if len(stopped):
+            logit = self._score(self.goal_judge, self.goal_logit, entries, len(stopped))
+            reward[stopped] = logit.sigmoid()
+        return reward
+
+    def _stopped(self, before: TensorDictBase, after: TensorDictBase, rows: int) -> Tensor:
+        if self.stop_action is None:
+            return self._rows(after, "terminated").reshape(rows).bool()
+        action = self._rows(before, self.action_key)
+        if action.ndim > 1 and action.shape[-1] > 1:
+            action = action.argmax(-1)
+        return action.reshape(rows) == self.stop_action
+
+    def _rows(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            hint = (
+                ": collect with LearnedReward on the environment, which carries it"
+                if unravel_key(key) == self.initial_pixels_key
+                else f": the tensordict has {sorted(map(str, tensordict.keys(True, True)))}"
+            )
+            raise UserError(f"{type(self).__name__} needs the entry {key!r}{hint}")
+        batch = tensordict.batch_size
+        return value.reshape(batch.numel(), *value.shape[len(batch) :])
+
+    def _score(
+        self,
+        judge: TensorDictModuleBase,
+        name: NestedKey,
+        entries: dict[NestedKey, Tensor],
+        rows: int,
+    ) -> Tensor:
+        """Logits [rows], on the device of the entries."""
+        home = next(iter(entries.values())).device
+        device = device_of(judge) or home
+        batch = TensorDict({}, batch_size=[rows])
+        for key, value in entries.items():
+            batch.set(key, value)
+        with judging(judge):
+            parts = [
+                flat_logit(judge(part.to(device)).get(name), len(part), name)
+                for part in batch.split(ROWS_AT_ONCE)
+            ]
+        return torch.cat(parts).to(home)
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        """Declare the learned reward beside the true one."""
+        reward_spec[self.reward_key] = Unbounded(
+            shape=(*reward_spec.shape, 1), dtype=torch.float32, device=reward_spec.device
+        )
+        return reward_spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Declare the first image of the episode where goals are judged."""
+        if self.judges_goals:
+            observation_spec[self.initial_pixels_key] = observation_spec[self.pixels_key].clone()
+        return observation_spec
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        """Declare what a step reads (batched environments send it to workers)."""
+        observations = self.parent.full_observation_spec
+        names = set(observations.keys(True, True))
+        for key in set(self.in_keys) & names - set(state_spec.keys(True, True)):
+            state_spec[key] = observations[key].clone()
+        if self.judges_goals:
+            state_spec[self.initial_pixels_key] = observations[self.pixels_key].clone()
+        return state_spec
+
+
+def formed(logit: Tensor, form: str) -> Tensor:
+    """Turn the logit of an action into its reward.
+
+    >>> formed(torch.tensor([0.0]), "centred").item()
+    0.0
+    """
+    if form == "log-odds":
+        return logit
+    probability = logit.sigmoid()
+    return probability - 0.5 if form == "centred" else probability

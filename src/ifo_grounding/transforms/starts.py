@@ -1,0 +1,196 @@
+"""Episodes that begin with stored pairs of a scene and an instruction."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
+from ifo_grounding.seeding import generator
+from ifo_grounding.transforms._common import InstructionTransform
+from ifo_grounding.transforms.choosing import check_pool
+
+FRAME_HASH = "frame_hash"
+"""Key of :func:`frame_hash` in stored pairs, int64 [N, 1]."""
+
+
+class StartingPairs(InstructionTransform):
+    """Begins every episode with one of a fixed list of scenes and its instruction.
+
+    The paper's second phase explores from 5K or 10K chosen pairs (paper, "Experimental Settings");
+    :func:`ifo_grounding.training.select_pairs` stores them. Each pair is used once, in random
+    order, before any is used again. The scene's number is handed to the simulator at the reset;
+    the instruction is written at the reset, carried along by every step, and declared in the
+    specs.
+
+    Args:
+        pairs: TensorDict [N] with ``scene`` int64 [N, 1] and ``instruction`` int64 [N, L]. With
+            ``frame_hash`` int64 [N, 1], every scene is checked to be the one that was stored.
+        seed: seed of the order.
+        instruction_key: key of the instruction in the environment.
+        pixels_key: key of the image.
+        vocabulary_size: number of token ids, for the spec; by default that of the environment, or
+            else one more than the largest id of the pairs.
+
+    Raises:
+        UserError: on pairs of another form; on an environment that exposes its true state, has an
+            instruction already, or draws other scenes than the stored ones; outside of a
+            ``SerialEnv`` or ``ParallelEnv`` (put it inside, with a part of the pairs each).
+
+    >>> from torchrl.envs import TransformedEnv
+    >>> from ifo_grounding.envs import PickAndPlaceEnv
+    >>> pairs = TensorDict(
+    ...     {"scene": torch.tensor([[7], [3], [5]]), "instruction": torch.ones(3, 16).long()}, [3]
+    ... )
+    >>> base = PickAndPlaceEnv("move", num_envs=3, seed=0, instructed=False)
+    >>> env = TransformedEnv(base, StartingPairs(pairs))
+    >>> _ = env.reset()
+    >>> sorted(base.scene_numbers.tolist())
+    [3, 5, 7]
+    """
+
+    def __init__(
+        self,
+        pairs: TensorDictBase,
+        seed: int = 0,
+        instruction_key: NestedKey = INSTRUCTION,
+        pixels_key: NestedKey = PIXELS,
+        vocabulary_size: int | None = None,
+    ) -> None:
+        super().__init__(in_keys=[pixels_key], out_keys=[instruction_key])
+        pairs = check_pairs(pairs)
+        self.vocabulary_size = vocabulary_size
+        self.register_buffer("scenes", pairs[SCENE].reshape(-1), persistent=False)
+        self.register_buffer("instructions", pairs[INSTRUCTION], persistent=False)
+        hashes = pairs.get(FRAME_HASH, None)
+        hashes = None if hashes is None else hashes.reshape(-1)
+        self.register_buffer("hashes", hashes, persistent=False)
+        self._begin(seed)
+
+    fixes_scenes = True
+    """The simulator's own seed decides nothing, since every scene is asked for by number."""
+
+    scenes: Tensor
+    instructions: Tensor
+    hashes: Tensor | None
+
+    @property
+    def tokens(self) -> Tensor:
+        """The pairs' instructions, int64 [N, L]."""
+        return self.instructions
+
+    def _begin(self, seed: int) -> None:
+        self.seed, self.used = seed, 0
+        self._epoch, self._order = -1, torch.empty(0, dtype=torch.int64)
+        self._current = torch.empty(0, dtype=torch.int64)
+
+    def get_extra_state(self) -> Tensor:
+        """Return the place in the order: ``state_dict`` resumes there."""
+        return torch.tensor([self.seed, self.used])
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Resume at a place in the order."""
+        seed, used = state.tolist()
+        self._begin(seed)
+        self.used = used
+
+    def _take(self, count: int) -> Tensor:
+        """Take the next pairs, int64 [count]."""
+        taken, pairs = [], len(self.scenes)
+        while count:
+            epoch, place = divmod(self.used, pairs)
+            if epoch != self._epoch:
+                source = generator(self.seed, "starting-pairs", epoch)
+                self._epoch, self._order = epoch, torch.randperm(pairs, generator=source)
+            part = self._order[place : place + count]
+            taken.append(part)
+            self.used += len(part)
+            count -= len(part)
+        return torch.cat(taken) if taken else self._order[:0]
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
+        parent = self.parent
+        if tensordict is None:
+            tensordict = TensorDict({}, batch_size=parent.batch_size, device=parent.device)
+        rows = tensordict.batch_size.numel()
+        beginning = self.beginning(tensordict, rows).cpu()
+        # Rows that go on get a valid number too: a first reset replaces every row.
+        current = torch.zeros(rows, dtype=torch.int64)
+        current[beginning] = self._take(len(beginning))
+        self._current = current.to(self.scenes.device)
+        return tensordict.set(SCENE, self.scenes[self._current].view(*tensordict.batch_size, 1))
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        batch = tensordict_reset.batch_size
+        if self.hashes is not None:
+            self._check_frames(tensordict, tensordict_reset)
+        instruction = self.instructions[self._current].reshape(*batch, -1)
+        tensordict_reset.set(self.out_keys[0], instruction)
+        return tensordict_reset
+
+    def _check_frames(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> None:
+        assert self.hashes is not None
+        batch = tensordict_reset.batch_size
+        pixels = tensordict_reset.get(self.in_keys[0])
+        pixels = pixels.reshape(batch.numel(), *pixels.shape[len(batch) :])
+        rows = self.beginning(tensordict, batch.numel()).to(pixels.device)
+        expected = self.hashes[self._current].to(pixels.device)[rows]
+        if (wrong := frame_hash(pixels[rows]) != expected).any():
+            number = int(self.scenes[self._current].to(pixels.device)[rows][wrong][0])
+            raise UserError(
+                f"scene {number} looks other than when its pair was stored: make the environment "
+                "with the task, seed, stream, layout and tile size that select_pairs was given"
+            )
+
+    def check_env(self, env: EnvBase) -> None:
+        """Raise :class:`UserError` where the innermost environment does not suit."""
+        super().check_env(env)
+        if isinstance(env, BatchedEnvBase):
+            raise UserError(
+                f"{type(self).__name__} cannot reach the simulators through a "
+                f"{type(env).__name__}: put it inside, around each worker's environment, with a "
+                "part of the pairs for each worker"
+            )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return stored data as it is: pairs are drawn where an environment resets."""
+        return tensordict
+
+
+def check_pairs(pairs: TensorDictBase) -> TensorDictBase:
+    """Return ``pairs`` if they are a TensorDict [N] of scenes and instructions.
+
+    Raises:
+        UserError: where they are not.
+    """
+    missing = [key for key in (SCENE, INSTRUCTION) if pairs.get(key, None) is None]
+    if missing:
+        raise UserError(f"pairs lack {missing}: they come from select_pairs or load_pairs")
+    check_pool(pairs[INSTRUCTION])
+    scene = pairs[SCENE]
+    if scene.is_floating_point() or scene.numel() != len(pairs[INSTRUCTION]):
+        raise UserError(f"scene must be int64 [N, 1], got {scene.dtype} {list(scene.shape)}")
+    return pairs
+
+
+def frame_hash(pixels: Tensor) -> Tensor:
+    """Return a number for each image that tells images apart, int64 [B].
+
+    >>> frames = torch.zeros(2, 3, 8, 8, dtype=torch.uint8)
+    >>> frames[1, 0, 0, 0] = 1
+    >>> frame_hash(frames).unique().numel()
+    2
+    """
+    flat = pixels.flatten(1).to(torch.uint8)
+    flat = torch.nn.functional.pad(flat, (0, -flat.shape[1] % 8)).contiguous()
+    words = flat.view(torch.int64)
+    # Odd multipliers keep every bit; int64 arithmetic wraps around, the same on any device.
+    place = torch.arange(words.shape[1], device=words.device) * 2 + 1
+    return ((words ^ (words >> 29)) * (place * 0x2545F4914F6CDD1D)).sum(-1)

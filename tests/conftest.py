@@ -1,0 +1,31 @@
+"""Every test starts from the same seeds, on one thread, away from the user's own folders."""
+
+from __future__ import annotations
+
+import os
+import random
+
+# Before matplotlib and pygame are imported anywhere: no test needs a screen.
+os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+import numpy as np
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def _seeds():
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002  the global generator is what other libraries read
+    torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def ifo_home(tmp_path_factory, monkeypatch):
+    """Folder that stands for the user's IFO_GROUNDING_HOME during one test."""
+    folder = tmp_path_factory.mktemp("home")
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(folder))
+    return folder

@@ -1,0 +1,212 @@
+"""The frame codec gives back every pixel, whatever the frames."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ifo_grounding.data import FrameCodec, _tile_index
+from ifo_grounding.data.codec import smallest_dtype
+from ifo_grounding.errors import UserError
+from ifo_grounding.world import random_layout, render
+from ifo_grounding.world.tiles import tile_index, tile_table
+
+
+@st.composite
+def any_frames(draw) -> torch.Tensor:
+    """Frames of any small shape; of few colours in 8-pixel blocks, or noise."""
+    frames, channels = draw(st.integers(0, 6)), draw(st.integers(1, 4))
+    side = st.sampled_from([1, 5, 8, 16, 24, 32, 33, 48])
+    height, width = draw(side), draw(side)
+    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+    shape = (frames, channels, height, width)
+    if draw(st.booleans()):
+        return torch.randint(256, shape, dtype=torch.uint8, generator=generator)
+    blocks = torch.randint(3, (frames, channels, -(-height // 8), -(-width // 8)))
+    pixels = blocks.repeat_interleave(8, 2).repeat_interleave(8, 3)
+    return (pixels[..., :height, :width] * 127).to(torch.uint8)
+
+
+@settings(max_examples=150, deadline=None)
+@given(any_frames())
+def test_any_frames_come_back(frames):
+    codec = FrameCodec.fit(frames)
+    codes = codec.encode(frames)
+    assert codes.shape == (len(frames), *codec.code_shape)
+    decoded = codec.decode(codes)
+    assert decoded.dtype == torch.uint8
+    assert torch.equal(decoded, frames)
+
+
+@settings(max_examples=50, deadline=None)
+@given(any_frames(), st.integers(1, 4))
+def test_pieces_give_the_same_as_the_whole(frames, size):
+    codec, codes = FrameCodec.compress(iter(frames.split(size)))
+    assert torch.equal(codec.decode(codes), frames)
+
+
+@settings(max_examples=50, deadline=None)
+@given(any_frames(), any_frames())
+def test_earlier_codes_stay_valid_when_frames_are_added(first, second):
+    codec = FrameCodec.fit(first)
+    if second.shape[1:] != codec.image_shape:
+        second = first.flip(0, -1)
+    early = codec.encode(first)
+    late = codec.update(second)
+    assert torch.equal(codec.decode(early), first)
+    assert torch.equal(codec.decode(late), second)
+    assert torch.equal(codec.encode(second), late)
+
+
+@pytest.mark.parametrize("tile_size", [8, 16, 32])
+def test_frames_of_the_world_shrink_a_hundredfold(tile_size):
+    frames = render(random_layout(400), tile_size)
+    codec, codes = FrameCodec.compress(frames)
+    assert codec.tile_size is not None
+    assert codec.tiles.unique(dim=0).shape == codec.tiles.shape
+    assert torch.equal(codec.decode(codes), frames)
+    assert codes.nbytes * 100 < frames.nbytes
+
+
+def test_batch_dimensions_are_kept():
+    frames = render(random_layout(12)).view(3, 4, 3, 48, 48)
+    codec = FrameCodec.fit(frames.flatten(0, 1), tile_size=8)
+    codes = codec.encode(frames)
+    assert codes.shape == (3, 4, 6, 6)
+    assert torch.equal(codec.decode(codes), frames)
+    assert torch.equal(codec.decode(codes[1, 2]), frames[1, 2])
+
+
+def test_noise_is_stored_as_pixels():
+    noise = torch.randint(256, (50, 3, 48, 48), dtype=torch.uint8)
+    codec, codes = FrameCodec.compress(noise)
+    assert (codec.tile_size, codec.tiles, codec.code_dtype) == (None, None, torch.uint8)
+    assert torch.equal(codes, noise)
+    assert repr(codec) == "FrameCodec(3x48x48, raw)"
+
+
+def test_a_long_stream_of_noise_is_given_up_on_the_way():
+    generator = torch.Generator().manual_seed(0)
+
+    def noise():
+        for _ in range(10):
+            yield torch.randint(256, (500, 1, 8, 8), dtype=torch.uint8, generator=generator)
+
+    codec, codes = FrameCodec.compress(noise())
+    generator.manual_seed(0)
+    assert codec.tile_size is None
+    assert torch.equal(codes, torch.cat(list(noise())))
+
+
+def test_a_large_frame_is_decoded_in_pieces_like_a_small_one():
+    frames = render(random_layout(700), 8)
+    codec, codes = FrameCodec.compress(frames, tile_size=8)
+    alone = torch.stack([codec.decode(code) for code in codes])
+    assert torch.equal(codec.decode(codes), alone)
+
+
+@pytest.mark.parametrize(
+    ("count", "dtype"),
+    [
+        (0, torch.uint8),
+        (256, torch.uint8),
+        (257, torch.int16),
+        (32768, torch.int16),
+        (32769, torch.int32),
+    ],
+)
+def test_codes_are_as_small_as_fits(count, dtype):
+    assert smallest_dtype(count) == dtype
+
+
+def test_codes_grow_with_the_dictionary():
+    def distinct(low, high):
+        number = torch.arange(low, high)
+        frames = torch.zeros(high - low, 1, 8, 64, dtype=torch.uint8)
+        frames[:, 0, 0, 0], frames[:, 0, 0, 1] = number % 256, number // 256
+        return frames
+
+    parts = [distinct(0, 200), distinct(200, 600)]
+    codec, codes = FrameCodec.compress(iter(parts), tile_size=8)
+    assert codes.dtype == torch.int16
+    assert len(codec.tiles) == 600
+    assert torch.equal(codec.decode(codes), torch.cat(parts))
+
+
+def test_tiles_with_equal_hashes_are_told_apart(monkeypatch):
+    strong = _tile_index.hash_rows
+
+    def weak(words, salt):
+        return strong(words, salt) % 8 if salt < 3 else strong(words, salt)
+
+    monkeypatch.setattr(_tile_index, "hash_rows", weak)
+    frames = render(random_layout(200))
+    codec, codes = FrameCodec.compress(frames, tile_size=8)
+    assert torch.equal(codec.decode(codes), frames)
+    with pytest.raises(UserError, match="not in the dictionary"):
+        codec.encode(255 - frames)
+
+
+def test_top_bits_alone_tell_tiles_apart():
+    rows = torch.zeros(4, 2, dtype=torch.int64)
+    rows[1, 0] = rows[2, 1] = rows[3, 0] = rows[3, 1] = -(2**63)
+    assert len(_tile_index.hash_rows(rows, 0).unique()) == 4
+
+
+def test_codes_of_a_renderer_say_nothing_that_pixels_do_not():
+    state = random_layout(300)
+    index, frames = tile_index(state), render(state)
+    codecs = [
+        FrameCodec.from_tiles(
+            tile_table(8), list(index.to(torch.int16).split(100)), torch.Generator().manual_seed(s)
+        )
+        for s in (0, 0, 1)
+    ]
+    for codec, codes in codecs:
+        assert torch.equal(codec.decode(codes), frames)
+        assert len(codec.tiles) == len(index.unique()) < len(tile_table(8))
+        assert codes.flatten().unique().tolist() == list(range(len(codec.tiles)))
+    assert torch.equal(codecs[0][1], codecs[1][1])
+    assert not torch.equal(codecs[0][1], codecs[2][1])
+    pairs = torch.stack([codecs[0][1].flatten().long(), index.flatten()]).unique(dim=1)
+    assert pairs.shape[1] == len(codecs[0][0].tiles)
+    assert abs(pairs.double().corrcoef()[0, 1]) < 0.3
+
+
+def test_equal_pictures_of_a_renderer_become_one():
+    tiles = torch.zeros(3, 3, 8, 8, dtype=torch.uint8)
+    tiles[2] = 9
+    codec, codes = FrameCodec.from_tiles(tiles, [torch.tensor([[[0, 1, 2]]])])
+    assert len(codec.tiles) == 2
+    assert codes[0, 0, 0] == codes[0, 0, 1] != codes[0, 0, 2]
+    assert codec.image_shape == (3, 8, 24)
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (torch.zeros(2, 3, 8, 8), "must be a uint8 tensor .F, C, H, W., got torch.float32"),
+        (torch.zeros(3, 8, 8, dtype=torch.uint8), "must be a uint8 tensor"),
+        ([], "no frames"),
+        ([[1]], "got list"),
+    ],
+)
+def test_other_things_than_frames_are_refused(frames, message):
+    with pytest.raises(UserError, match=message):
+        FrameCodec.fit(frames)
+
+
+def test_misfits_are_refused():
+    frames = torch.zeros(2, 3, 24, 16, dtype=torch.uint8)
+    with pytest.raises(UserError, match=r"tile size 16 does not divide .* 24 x 16 .* \[8\]"):
+        FrameCodec.fit(frames, tile_size=16)
+    with pytest.raises(UserError, match=r"frames are \[3, 16, 24\], this codec's .* \[3, 24, 16\]"):
+        FrameCodec.fit(frames).encode(frames.transpose(2, 3))
+    with pytest.raises(UserError, match="do not cover images"):
+        FrameCodec((3, 24, 16), torch.zeros(1, 3, 16, 16, dtype=torch.uint8))
+    with pytest.raises(UserError, match="give each tile once"):
+        FrameCodec((3, 24, 16), torch.zeros(2, 3, 8, 8, dtype=torch.uint8))
+    with pytest.raises(UserError, match="no frames"):
+        FrameCodec.from_tiles(torch.zeros(2, 3, 8, 8, dtype=torch.uint8), [])

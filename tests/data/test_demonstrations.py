@@ -1,0 +1,431 @@
+"""Demonstrations: what they give, what they refuse, and that there is no place for actions."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import json
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ifo_grounding.data import Demonstrations, FrameCodec
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
+from ifo_grounding.world import random_layout, render
+
+LENGTHS = [3, 1, 5, 2]
+SENTENCES = ["go up", "go left", "go up", "take it"]
+
+
+def episodes(seed: int = 0) -> list[torch.Tensor]:
+    """Frames of four episodes, all different."""
+    draw = torch.Generator().manual_seed(seed)
+    return list(render(random_layout(sum(LENGTHS), generator=draw)).split(LENGTHS))
+
+
+@pytest.fixture
+def demos() -> Demonstrations:
+    return Demonstrations.from_arrays(episodes(), SENTENCES)
+
+
+def numbered(n: int = 50, length: int = 4) -> Demonstrations:
+    """Episodes whose frames say (episode, time), stored as pixels."""
+    frames = torch.zeros(n, length, 2, 3, 3, dtype=torch.uint8)
+    frames[:, :, 0] = torch.arange(n).view(n, 1, 1, 1)
+    frames[:, :, 1] = torch.arange(length).view(1, length, 1, 1)
+    return Demonstrations.from_arrays(list(frames), torch.arange(n).view(n, 1))
+
+
+# ---- What they give ---------------------------------------------------------------------------
+
+
+def test_frames_and_instructions_come_back(demos):
+    assert (len(demos), demos.n_frames, demos.transitions) == (4, 11, 7)
+    assert demos.lengths.tolist() == LENGTHS
+    assert demos.starts.tolist() == [0, 3, 4, 9]
+    assert demos.image_shape == (3, 48, 48)
+    assert demos.instruction_length == 16
+    assert demos.sentences() == SENTENCES
+    assert demos.vocabulary_size == len(demos.vocabulary) == 6
+    assert demos.instructions.dtype == torch.int64
+    for number, frames in enumerate(episodes()):
+        one = demos[number]
+        assert one.batch_size == (LENGTHS[number],)
+        assert torch.equal(one["pixels"], frames)
+        assert (one["instruction"] == demos.instructions[number]).all()
+        assert demos.vocabulary.decode(one["instruction"])[0] == SENTENCES[number]
+    for last in (-1, np.int64(3), torch.tensor(3)):
+        assert torch.equal(demos[last]["pixels"], episodes()[3])
+
+
+def test_they_are_a_sequence(demos):
+    assert [len(one) for one in demos] == LENGTHS
+    with pytest.raises(IndexError, match="demonstration 4 of 4"):
+        demos[4]
+
+
+def test_a_selection_shares_the_frames(demos):
+    for index in (torch.tensor([2, 0]), [2, 0], slice(2, None), torch.tensor([0, 0, 1, 1]).bool()):
+        chosen = demos[index]
+        assert chosen.codes is demos.codes
+        assert len(chosen) == 2
+        assert torch.equal(chosen[0]["pixels"], episodes()[2])
+    assert demos[torch.tensor([2, 0])].sentences() == ["go up", "go up"]
+    assert torch.equal(demos[[2, 0]][1]["pixels"], episodes()[0])
+    assert torch.equal(demos[[2, 0]][[1]][0]["pixels"], episodes()[0])
+
+
+def test_what_is_read_can_be_written_without_harm():
+    demos = numbered()
+    demos[3]["pixels"].fill_(77)
+    demos.first_frames().fill_(77)
+    assert demos[3]["pixels"][0, 0, 0, 0] == 3
+
+
+def test_first_and_last_frames(demos):
+    index = torch.tensor([3, 0])
+    for given, time in ((demos.first_frames, 0), (demos.last_frames, -1)):
+        expected = torch.stack([episodes()[i][time] for i in (3, 0)])
+        assert torch.equal(given(index), expected)
+        assert torch.equal(given()[index], expected)
+    assert torch.equal(demos.frames(torch.tensor([[4, 5]]))[0], episodes()[2][:2])
+
+
+def test_transitions_are_located_episode_by_episode(demos):
+    episode, frame = demos.locate()
+    assert episode.tolist() == [0, 0, 2, 2, 2, 2, 3]
+    assert frame.tolist() == [0, 1, 4, 5, 6, 7, 9]
+    episode, frame = demos[[3, 1, 0]].locate(torch.tensor([2, 0, 1]))
+    assert episode.tolist() == [2, 0, 2]
+    assert frame.tolist() == [1, 9, 0]
+
+
+def test_sampled_transitions_are_neighbours_of_one_episode():
+    demos = numbered()
+    draw = torch.Generator().manual_seed(0)
+    sample = demos.sample_transitions(6000, draw)
+    now, then = sample["pixels"][:, :, 0, 0].long(), sample["next", "pixels"][:, :, 0, 0].long()
+    assert (now[:, 0] == then[:, 0]).all()
+    assert (now[:, 1] + 1 == then[:, 1]).all()
+    assert (sample["instruction"].squeeze(1) == now[:, 0]).all()
+    counts = (now[:, 0] * 3 + now[:, 1]).bincount(minlength=150)
+    assert counts.min() >= 15 and counts.max() <= 75  # 40 expected each
+    draw.manual_seed(0)
+    assert (demos.sample_transitions(6000, draw) == sample).all()
+    assert set(sample.keys(True, True)) == {"pixels", "instruction", ("next", "pixels")}
+
+
+def test_sampled_episodes_are_whole_and_padded(demos):
+    sample = demos.sample_episodes(64, torch.Generator().manual_seed(0))
+    assert sample.batch_size == (64, 5)
+    assert set(sample["mask"].sum(1).tolist()) == set(LENGTHS)
+    for row in sample:
+        length = int(row["mask"].sum())
+        assert row["mask"].tolist() == [True] * length + [False] * (5 - length)
+        frames = episodes()[LENGTHS.index(length)]
+        assert torch.equal(row["pixels"][:length], frames)
+        assert (row["pixels"][length:] == frames[-1]).all()
+        sentence = SENTENCES[LENGTHS.index(length)]
+        assert demos.vocabulary.decode(row["instruction"]) == [sentence] * 5
+
+
+def test_the_pool_holds_each_instruction_once(demos):
+    pool = demos.pool()
+    assert pool.dtype == torch.int64
+    assert sorted(demos.vocabulary.decode(pool)) == ["go left", "go up", "take it"]
+    tokens = torch.randint(0, 3, (500, 4))
+    frames = [torch.zeros(1, 1, 8, 8, dtype=torch.uint8)] * 500
+    pool = Demonstrations.from_arrays(frames, tokens).pool()
+    assert torch.equal(pool, tokens.unique(dim=0))
+
+
+def test_a_split_sets_episodes_aside():
+    demos = numbered()
+    rest, aside = demos.split(0.2, seed=1)
+    assert (len(rest), len(aside)) == (40, 10)
+    together = torch.cat([rest.instructions, aside.instructions]).flatten()
+    assert sorted(together.tolist()) == list(range(50))
+    assert torch.equal(demos.split(0.2, seed=1)[1].instructions, aside.instructions)
+    assert not torch.equal(demos.split(0.2, seed=2)[1].instructions, aside.instructions)
+    with pytest.raises(UserError, match="fraction must be within"):
+        demos.split(20)
+
+
+def test_episodes_are_closed_where_they_do_not_end_with_a_repeated_frame():
+    first, alone, second, closed = episodes()
+    closed = closed[[0, 0]]
+    demos = Demonstrations.from_arrays([first, alone, second, closed], SENTENCES).close_episodes()
+    assert demos.lengths.tolist() == [4, 2, 6, 2]
+    for number, frames in enumerate((first, alone, second)):
+        assert torch.equal(demos[number]["pixels"], torch.cat([frames, frames[-1:]]))
+    assert torch.equal(demos[3]["pixels"], closed)
+    assert demos.sentences() == SENTENCES
+    again = demos.close_episodes()
+    assert torch.equal(again.codes, demos.codes) and torch.equal(again.lengths, demos.lengths)
+
+
+def test_frames_may_come_as_a_generator_of_numpy_arrays():
+    given = (frames.numpy() for frames in episodes())
+    demos = Demonstrations.from_arrays(given, VOCABULARY.encode(["go up"] * 4), tile_size=16)
+    assert torch.equal(demos[2]["pixels"], episodes()[2])
+    assert (demos.vocabulary, demos.vocabulary_size, demos.tile_size) == (
+        None,
+        int(VOCABULARY.encode("go up").max()) + 1,
+        16,
+    )
+    with pytest.raises(UserError, match="without a vocabulary"):
+        demos.sentences()
+
+
+def test_many_short_episodes_are_read_in_pieces():
+    frames = [render(random_layout(3)) for _ in range(400)]
+    demos = Demonstrations.from_arrays(iter(frames), ["go"] * 400)
+    assert all(torch.equal(demos[i]["pixels"], frames[i]) for i in (0, 170, 171, 399))
+
+
+# ---- No place for actions ---------------------------------------------------------------------
+
+
+def test_there_is_no_place_for_actions(demos):
+    for call in (Demonstrations, Demonstrations.from_arrays, Demonstrations.load):
+        assert not any("action" in name for name in inspect.signature(call).parameters)
+    for name in ("action", "actions", "state", "reward"):
+        with pytest.raises(AttributeError):
+            setattr(demos, name, torch.zeros(7))
+        assert not hasattr(demos, name)
+        with pytest.raises(UserError, match=f"no entry '{name}': they hold pixels and instr"):
+            demos[name]
+    with pytest.raises(UserError, match="no entry"):
+        demos["next", "action"]
+    with pytest.raises(TypeError, match="actions"):
+        Demonstrations(demos.codec, demos.codes, demos.lengths, demos.tokens, actions=None)
+    with pytest.raises(TypeError):
+        demos["action"] = torch.zeros(4)
+    samples = (demos[0], demos.sample_transitions(2), demos.sample_episodes(2))
+    for sample in samples:
+        assert not any("action" in str(key) for key in sample.keys(True, True))
+
+
+def test_a_folder_with_actions_is_refused(demos, tmp_path):
+    demos.save(tmp_path / "d")
+    actions = np.zeros(7, np.int64)
+    np.save(tmp_path / "d" / "actions.npy", actions)
+    edit(
+        tmp_path / "d",
+        lambda meta: meta["arrays"].update(
+            actions={"dtype": "int64", "shape": [7], "bytes": 184, "crc32": 0}
+        ),
+    )
+    with pytest.raises(UserError, match=r"holds actions, which .* have no place for"):
+        Demonstrations.load(tmp_path / "d")
+
+
+# ---- What they refuse -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lengths": torch.tensor([3, 1, 5, 3])}, "add up to 12 frames, there are 11"),
+        ({"lengths": torch.tensor([3, 0, 6, 2])}, "at least 1"),
+        ({"lengths": torch.tensor([3.0, 1, 5, 2])}, "integer tensor"),
+        ({"codes": torch.zeros(11, 5, 6, dtype=torch.uint8)}, r"makes integers \[F, 6, 6\]"),
+        ({"codes": torch.full((11, 6, 6), 200)}, "codes hold tile 200: the dictionary has"),
+        ({"codes": torch.full((11, 6, 6), -1)}, "codes hold tile -1"),
+        ({"instructions": torch.zeros(3, 16).long()}, "for 4 episodes"),
+        ({"instructions": torch.zeros(4, 16)}, "integer token ids"),
+        ({"instructions": torch.full((4, 16), 99)}, r"token 99: the vocabulary has ids 0\.\.5"),
+        ({"instructions": torch.full((4, 16), -2)}, "token -2"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(change, message):
+    codec, codes = FrameCodec.compress(torch.cat(episodes()), tile_size=8)
+    tokens = Vocabulary.from_sentences(SENTENCES).encode(SENTENCES)
+    parts = {"codes": codes, "lengths": torch.tensor(LENGTHS), "instructions": tokens}
+    Demonstrations(codec, **parts, vocabulary_size=6)
+    with pytest.raises(UserError, match=message):
+        Demonstrations(codec, **{**parts, **change}, vocabulary_size=6)
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ([torch.zeros(2, 8, 8, 3)], "episode 0 is torch.float32"),
+        ([torch.zeros(8, 8, 3, dtype=torch.uint8)], r"give uint8 \[T \+ 1, C, H, W\]"),
+        ([torch.zeros(0, 3, 8, 8, dtype=torch.uint8)], "at least one frame"),
+        (
+            [torch.zeros(2, 3, s, s, dtype=torch.uint8) for s in (8, 16)],
+            r"episode 1 has images \[3, 16, 16\], the others have \[3, 8, 8\]",
+        ),
+    ],
+)
+def test_other_arrays_than_frames_are_refused(frames, message):
+    with pytest.raises(UserError, match=message):
+        Demonstrations.from_arrays(frames, ["go up"] * len(frames))
+
+
+def test_sampling_from_nothing_is_refused(demos):
+    with pytest.raises(UserError, match="no episode has two frames"):
+        demos[[1]].sample_transitions(3)
+    with pytest.raises(UserError, match="no demonstrations"):
+        demos[:0].sample_episodes(3)
+
+
+# ---- Files ------------------------------------------------------------------------------------
+
+
+def edit(folder, change):
+    path = folder / "meta.json"
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+def resave(folder, name, array):
+    """Replace an array and make size, type and checksum agree."""
+    np.save(folder / f"{name}.npy", array)
+    content = (folder / f"{name}.npy").read_bytes()
+    facts = {
+        "dtype": str(array.dtype),
+        "shape": list(array.shape),
+        "bytes": len(content),
+        "crc32": zlib.crc32(content),
+    }
+    edit(folder, lambda meta: meta["arrays"].update({name: facts}))
+
+
+def same(left: Demonstrations, right: Demonstrations) -> bool:
+    return (
+        torch.equal(left.lengths, right.lengths)
+        and torch.equal(left.instructions, right.instructions)
+        and left.vocabulary == right.vocabulary
+        and left.vocabulary_size == right.vocabulary_size
+        and all(torch.equal(a["pixels"], b["pixels"]) for a, b in zip(left, right, strict=True))
+    )
+
+
+def test_saved_demonstrations_are_the_same_and_stay_on_disk(demos, tmp_path):
+    demos.save(tmp_path / "d")
+    loaded = Demonstrations.load(tmp_path / "d")
+    assert same(loaded, demos)
+    assert f"{tmp_path}/d/codes.npy" in Path("/proc/self/maps").read_text()
+    loaded.save(tmp_path / "d")
+    assert same(Demonstrations.load(tmp_path / "d"), demos)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d"]
+
+
+def test_a_selection_is_saved_alone(demos, tmp_path):
+    chosen = demos[[2, 0]]
+    chosen.save(tmp_path / "d")
+    loaded = Demonstrations.load(tmp_path / "d")
+    assert same(loaded, chosen)
+    assert len(loaded.codes) == 8
+
+
+def test_raw_and_empty_demonstrations_are_saved(demos, tmp_path):
+    raw = numbered()
+    raw.save(tmp_path / "raw")
+    assert same(Demonstrations.load(tmp_path / "raw"), raw)
+    demos[:0].save(tmp_path / "empty")
+    assert len(Demonstrations.load(tmp_path / "empty")) == 0
+
+
+def test_a_failing_save_leaves_the_old_folder(demos, tmp_path):
+    demos.save(tmp_path / "d")
+    broken = copy.copy(demos)
+    broken.vocabulary = copy.copy(demos.vocabulary)
+    broken.vocabulary.words = (object(),)
+    with pytest.raises(TypeError):
+        broken.save(tmp_path / "d")
+    assert same(Demonstrations.load(tmp_path / "d"), demos)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["d"]
+
+
+def truncate(folder):
+    content = (folder / "codes.npy").read_bytes()
+    (folder / "codes.npy").write_bytes(content[:-1])
+
+
+def flip(folder):
+    content = bytearray((folder / "tiles.npy").read_bytes())
+    content[-1] ^= 1
+    (folder / "tiles.npy").write_bytes(content)
+
+
+def fill_with_objects(folder):
+    np.save(folder / "lengths.npy", np.array([{}], dtype=object), allow_pickle=True)
+    content = (folder / "lengths.npy").read_bytes()
+    facts = {"bytes": len(content), "crc32": zlib.crc32(content)}
+    edit(folder, lambda meta: meta["arrays"]["lengths"].update(facts))
+
+
+DAMAGE = {
+    "no folder": (lambda f: f.rename(f.with_name("moved")), "is not a folder of"),
+    "no meta": (lambda f: (f / "meta.json").unlink(), "it has no meta.json"),
+    "bad json": (lambda f: (f / "meta.json").write_text("{"), "meta.json is not valid JSON"),
+    "list": (lambda f: (f / "meta.json").write_text("[]"), "holds 'list', not 'ifo-grounding dem"),
+    "other kind": (lambda f: edit(f, lambda m: m.update(format="hats")), "holds 'hats', not"),
+    "version": (
+        lambda f: edit(f, lambda m: m.update(version=9)),
+        "version 9, this library",
+    ),
+    "no arrays": (lambda f: edit(f, lambda m: m.pop("arrays")), "lacks its arrays"),
+    "unlisted": (lambda f: edit(f, lambda m: m["arrays"].pop("lengths")), "does not list lengths"),
+    "no entry": (
+        lambda f: edit(f, lambda m: m["arrays"].update(codes=3)),
+        "describes codes.npy",
+    ),
+    "missing file": (lambda f: (f / "codes.npy").unlink(), "codes.npy is missing"),
+    "truncated": (truncate, "codes.npy has .* bytes, meta.json says .*: it is truncated"),
+    "damaged": (flip, "tiles.npy is damaged: its checksum"),
+    "pickle": (fill_with_objects, "lengths.npy is not a readable .npy file: .*Python objects"),
+    "shape": (
+        lambda f: edit(f, lambda m: m["arrays"]["codes"].update(shape=[1, 1, 1])),
+        r"codes.npy holds uint8 \[11, .*\], meta.json says uint8 \[1, 1, 1\]",
+    ),
+    "no words": (lambda f: edit(f, lambda m: m["facts"].pop("words")), "no usable 'words'"),
+    "words twice": (
+        lambda f: edit(f, lambda m: m["facts"].update(words=["a", "a"])),
+        "word twice",
+    ),
+    "words of numbers": (lambda f: edit(f, lambda m: m["facts"].update(words=[1])), "is damaged"),
+    "image shape": (
+        lambda f: edit(f, lambda m: m["facts"].update(image_shape=[3, 50, 48])),
+        "do not cover images",
+    ),
+    "image shape type": (
+        lambda f: edit(f, lambda m: m["facts"].update(image_shape=["a"])),
+        "is damaged",
+    ),
+    "code out of range": (
+        lambda f: resave(f, "codes", np.full((11, 6, 6), 255, np.uint8)),
+        "codes hold tile 255: the dictionary has",
+    ),
+    "lengths": (
+        lambda f: resave(f, "lengths", np.array([3, 1, 5, 9])),
+        "add up to 18 frames, there are 11",
+    ),
+    "tokens": (
+        lambda f: resave(f, "instructions", np.full((4, 16), 7, np.int16)),
+        "instructions hold token 7",
+    ),
+    "no tiles": (lambda f: edit(f, lambda m: m["arrays"].pop("tiles")), "makes integers"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_or_foreign_folder_is_refused_with_what_is_wrong(name, tmp_path):
+    demos = Demonstrations.from_arrays(episodes(), SENTENCES, tile_size=8)
+    folder = tmp_path / "d"
+    demos.save(folder)
+    assert same(Demonstrations.load(folder), demos)
+    damage, message = DAMAGE[name]
+    damage(folder)
+    with pytest.raises(UserError, match=message) as error:
+        Demonstrations.load(folder)
+    assert str(folder) in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,176 @@
+"""Labels: an inverse model that is right gives a buffer that is right."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from ifo_grounding.data import (
+    Demonstrations,
+    LabelReport,
+    label_demonstrations,
+    labelled_buffer,
+    record_demonstrations,
+)
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks import TASKS
+
+
+class WatchTheArm(nn.Module):
+    """An inverse model written by hand: the arm's cell is the one with a white corner."""
+
+    def __init__(self, logit: float = 9.0) -> None:
+        super().__init__()
+        self.logit = nn.Parameter(torch.tensor(logit))
+        self.noise = nn.Dropout(0.9)
+
+    def arm(self, pixels: Tensor) -> Tensor:
+        return (pixels[:, :, ::8, ::8] == 255).all(1).flatten(1).float().argmax(1)
+
+    def forward(self, pixels: Tensor, after: Tensor) -> Tensor:
+        moved = self.arm(after) - self.arm(pixels)
+        same = (pixels == after).flatten(1).all(1)
+        action = torch.where(same, 5, 4)
+        for number, distance in enumerate((-6, 1, 6, -1)):
+            action = torch.where(moved == distance, number, action)
+        return self.noise(nn.functional.one_hot(action, 6) * self.logit)
+
+
+@pytest.fixture
+def inverse() -> TensorDictModule:
+    return TensorDictModule(WatchTheArm(), ["pixels", ("next", "pixels")], ["logits"])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_labels_are_what_the_expert_did(task, inverse):
+    demos, truth = record_demonstrations(task, 60, keep_truth=True)
+    buffer, report = label_demonstrations(demos, inverse, batch_size=100, progress=False)
+    assert torch.equal(report.actions, truth.actions)
+    assert torch.equal(report.counts, truth.actions.long().bincount(minlength=6))
+    assert report.counts[5] == 60
+    assert len(buffer) == demos.transitions
+
+
+def test_samples_are_the_demonstrations_own_transitions(inverse):
+    demos, truth = record_demonstrations("pick", 20, keep_truth=True)
+    buffer, _ = label_demonstrations(
+        demos, inverse, progress=False, next_pixels=True, initial_pixels=True
+    )
+    row = 0
+    for episode, one in enumerate(demos):
+        steps = len(one) - 1
+        entries = buffer[row : row + steps]
+        assert torch.equal(entries["pixels"], one["pixels"][:-1])
+        assert torch.equal(entries["next", "pixels"], one["pixels"][1:])
+        assert (entries["initial_pixels"] == one["pixels"][0]).all()
+        assert (entries["instruction"] == demos.instructions[episode]).all()
+        assert torch.equal(entries["action"], truth.actions[row : row + steps].long())
+        assert entries["final"].squeeze(-1).tolist() == [False] * (steps - 1) + [True]
+        assert entries["final"].shape == (steps, 1)
+        row += steps
+    sample = buffer.sample(64)
+    assert sample["instruction"].dtype == sample["action"].dtype == torch.int64
+    assert torch.equal(buffer[sample["index"]]["pixels"], sample["pixels"])
+    assert torch.equal(buffer[sample["index"]]["instruction"], sample["instruction"])
+
+
+def test_samples_hold_what_was_asked_for_and_follow_the_generator():
+    demos, truth = record_demonstrations("move", 10, keep_truth=True)
+    buffers = [
+        labelled_buffer(
+            demos, truth.actions, generator=torch.Generator().manual_seed(3), batch_size=16
+        )
+        for _ in range(2)
+    ]
+    first, second = (buffer.sample() for buffer in buffers)
+    assert set(first.keys(True, True)) == {"pixels", "instruction", "action", "final", "index"}
+    assert (first == second).all()
+
+
+def test_a_selection_is_labelled_alone(inverse):
+    demos = record_demonstrations("move-udlr", 30)
+    chosen = demos[[7, 21]]
+    buffer, report = label_demonstrations(chosen, inverse, progress=False)
+    assert len(buffer) == len(report.actions) == chosen.transitions
+    assert torch.equal(buffer[0]["pixels"], demos[7]["pixels"][0])
+    assert buffer[:]["final"].sum() == 2
+
+
+def test_the_model_is_evaluated_and_left_as_it_was(inverse):
+    demos = record_demonstrations("move", 5)
+    inverse.train()
+    inverse.module.noise.eval()
+    _, report = label_demonstrations(demos, inverse, progress=False)
+    assert report.confidence.min() > 0.99 and not report.confidence.requires_grad
+    assert inverse.training and inverse.module.training and not inverse.module.noise.training
+    with pytest.raises(UserError, match="wrote nothing at 'scores', not logits"):
+        label_demonstrations(demos, inverse, progress=False, logits_key="scores")
+    assert inverse.training and not inverse.module.noise.training
+
+
+def test_the_report_says_how_sure_the_model_was(inverse):
+    demos = record_demonstrations("move", 50)
+    inverse.module.logit.data.fill_(1.0)
+    _, report = label_demonstrations(demos, inverse, progress=False)
+    expected = torch.tensor([1.0, 0, 0, 0, 0, 0]).softmax(0)[0]
+    torch.testing.assert_close(report.confidence, expected.expand(demos.transitions))
+
+    actions = torch.tensor([2, 0, 2, 2], dtype=torch.uint8)
+    report = LabelReport(actions, torch.tensor([0.5, 0.75, 1.0, 0.75]), 4)
+    rows = report.summary()
+    assert [row["count"] for row in rows] == [1, 0, 3, 0]
+    assert rows[1] == {"action": 1, "count": 0}
+    assert rows[2] == {
+        "action": 2, "count": 3, "mean": 0.75, "min": 0.5, "p01": 0.5, "p10": 0.5, "median": 0.75
+    }  # fmt: skip
+    assert str(report).splitlines()[3].split() == ["2", "3", "0.7500", *["0.5000"] * 3, "0.7500"]
+
+
+def test_a_saved_report_makes_the_buffer_again(tmp_path, inverse):
+    demos = record_demonstrations("move", 10)
+    _, report = label_demonstrations(demos, inverse, progress=False)
+    report.save(tmp_path / "labels")
+    loaded = LabelReport.load(tmp_path / "labels")
+    assert torch.equal(loaded.actions, report.actions)
+    assert torch.equal(loaded.confidence, report.confidence)
+    assert loaded.n_actions == 6
+    buffer = labelled_buffer(demos, loaded.actions)
+    assert torch.equal(buffer[:]["action"], report.actions.long())
+    with pytest.raises(UserError, match="were they made for these demonstrations"):
+        labelled_buffer(demos[:5], loaded.actions)
+    with pytest.raises(UserError, match="holds 'ifo-grounding labels', not"):
+        Demonstrations.load(tmp_path / "labels")
+    LabelReport(report.actions, report.confidence, 2).save(tmp_path / "labels")
+    with pytest.raises(UserError, match=r"an action outside 0\.\.1"):
+        LabelReport.load(tmp_path / "labels")
+    LabelReport(report.actions, report.confidence[1:], 6).save(tmp_path / "labels")
+    with pytest.raises(UserError, match="not of one length"):
+        LabelReport.load(tmp_path / "labels")
+
+
+def test_bad_input_is_refused(inverse):
+    demos = record_demonstrations("move", 5)
+    with pytest.raises(UserError, match="batch_size must be"):
+        label_demonstrations(demos, inverse, batch_size=0)
+    alone = Demonstrations.from_arrays([torch.zeros(1, 3, 8, 8, dtype=torch.uint8)], ["go"])
+    with pytest.raises(UserError, match="nothing to label"):
+        label_demonstrations(alone, inverse)
+    flat = TensorDictModule(lambda pixels: pixels.float().flatten(2), ["pixels"], ["logits"])
+    with pytest.raises(UserError, match=r"wrote \[\d+, 3, 2304\] at 'logits'"):
+        label_demonstrations(demos, flat, progress=False)
+
+
+def test_the_bar_counts_transitions(inverse, capsys):
+    demos = record_demonstrations("move", 5)
+    label_demonstrations(demos, inverse)
+    assert f"{demos.transitions}/{demos.transitions}" in capsys.readouterr().err
+
+
+def test_a_tensordict_of_one_demonstration_fits_the_model(inverse):
+    demos, truth = record_demonstrations("pick", 1, keep_truth=True)
+    frames = demos[0]["pixels"]
+    pair = TensorDict({"pixels": frames[:-1], "next": {"pixels": frames[1:]}}, [len(frames) - 1])
+    assert torch.equal(inverse.eval()(pair)["logits"].argmax(-1), truth.actions.long())

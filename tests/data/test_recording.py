@@ -1,0 +1,176 @@
+"""Recorded demonstrations show an expert at work, and the truth is kept apart."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import ifo_grounding
+from ifo_grounding.data import Demonstrations, Truth, record_demonstrations
+from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import derive
+from ifo_grounding.tasks import TASKS, SceneOptions, SceneStream, achieved, grammar, suitable
+from ifo_grounding.tasks.grammar import in_split
+from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.world import Layout, render, step
+
+SOURCE = Path(ifo_grounding.__file__).parents[1]
+
+
+def scenes_of(task: str, n: int, seed: int = 0, **options):
+    """The scenes that a recording begins with."""
+    stream = SceneStream(SceneOptions(task, **options), derive(seed, "demonstrations"))
+    return stream.scenes(torch.arange(n))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_frames_show_the_actions_that_fulfil_the_instruction(task):
+    demos, truth = record_demonstrations(task, 40, seed=3, keep_truth=True)
+    scenes = scenes_of(task, 40, seed=3)
+    assert suitable(scenes.state, truth.goals).all()
+    actions = truth.actions.long().split((demos.lengths - 1).tolist())
+    for number in range(40):
+        state = scenes.state[number : number + 1]
+        pixels = demos[number]["pixels"]
+        assert len(pixels) == len(actions[number]) + 1 == scenes.wanted.steps[number] + 1
+        for time, action in enumerate(actions[number]):
+            assert torch.equal(render(state)[0], pixels[time])
+            state = step(state, action.view(1))
+        assert torch.equal(render(state)[0], pixels[-1])
+        assert torch.equal(pixels[-2], pixels[-1])
+        assert (actions[number] == 5).tolist() == [False] * (len(actions[number]) - 1) + [True]
+        goal = truth.goals[number : number + 1]
+        assert achieved(scenes.state[number : number + 1], state, goal).all()
+        assert (grammar(task).parse(demos.sentences()[number]) == goal).all()
+
+
+def test_same_seed_same_demonstrations():
+    first, second, other = (record_demonstrations("pick", 30, seed=s) for s in (1, 1, 2))
+    assert torch.equal(first.codes, second.codes)
+    assert torch.equal(first.instructions, second.instructions)
+    assert torch.equal(first.codec.tiles, second.codec.tiles)
+    assert not torch.equal(first.instructions, other.instructions)
+
+
+def test_more_demonstrations_begin_with_the_same_ones():
+    few, many = record_demonstrations("move", 5), record_demonstrations("move", 9)
+    assert torch.equal(few.instructions, many.instructions[:5])
+    assert torch.equal(few.first_frames(), many.first_frames()[:5])
+
+
+def test_batches_are_joined_in_order():
+    demos, truth = record_demonstrations("move", 4200, keep_truth=True)
+    scenes = scenes_of("move", 4200)
+    assert torch.equal(demos.first_frames(), render(scenes.state))
+    assert torch.equal(demos.instructions, scenes.instruction)
+    assert torch.equal(demos.lengths, scenes.wanted.steps + 1)
+    _, first_frame = demos.locate()
+    last = (demos.starts + demos.lengths - 2)[demos.locate()[0]]
+    assert torch.equal(truth.actions == 5, first_frame == last)
+
+
+def test_scenes_are_not_those_of_an_environment_of_the_same_seed():
+    shown = SceneStream(SceneOptions("move"), 0).scenes(torch.arange(1000))
+    recorded = scenes_of("move", 1000)
+    frames = torch.cat([render(shown.state), render(recorded.state)]).flatten(1)
+    assert len(frames.unique(dim=0)) == 2000
+
+
+def test_streams_and_splits_differ():
+    firsts = [
+        record_demonstrations("move", 50, stream=stream).first_frames()
+        for stream in ("training", "validation", "evaluation")
+    ]
+    assert len(torch.cat(firsts).flatten(1).unique(dim=0)) == 150
+    for split in ("train", "zero-shot"):
+        _, truth = record_demonstrations(
+            "pick-udlr", 100, split=split, holdout="pairs-2", keep_truth=True
+        )
+        assert in_split(truth.goals, split, "pairs-2").all()
+
+
+@pytest.mark.parametrize(("tile_size", "size"), [(16, 6), (32, 4), (8, 10)])
+def test_other_sizes(tile_size, size):
+    demos = record_demonstrations("move", 20, tile_size=tile_size, layout=Layout(size=size))
+    side = tile_size * size
+    assert demos.image_shape == (3, side, side)
+    scenes = scenes_of("move", 20, layout=Layout(size=size))
+    assert torch.equal(demos.first_frames(), render(scenes.state, tile_size))
+
+
+def test_codes_are_small_and_say_nothing_more():
+    demos = record_demonstrations("pick", 300)
+    assert demos.n_frames * 3 * 48 * 48 > 30 * demos.nbytes
+    assert torch.equal(demos.codes.unique().long(), torch.arange(len(demos.codec.tiles)))
+    assert record_demonstrations("move", 300).codes.dtype == torch.uint8
+    assert demos.vocabulary == VOCABULARY
+
+
+def test_truth_has_a_folder_of_its_own(tmp_path):
+    demos, truth = record_demonstrations("pick-out", 12, keep_truth=True)
+    assert truth.actions.dtype == torch.uint8
+    truth.save(tmp_path / "truth")
+    demos.save(tmp_path / "demos")
+    loaded = Truth.load(tmp_path / "truth")
+    assert torch.equal(loaded.actions, truth.actions)
+    assert (loaded.goals == truth.goals).all() and loaded.goals.task.dtype == torch.int64
+    assert not [path for path in (tmp_path / "demos").iterdir() if "action" in path.name]
+    with pytest.raises(UserError, match="holds 'ifo-grounding truth', not 'ifo-grounding demon"):
+        Demonstrations.load(tmp_path / "truth")
+    with pytest.raises(UserError, match="not 'ifo-grounding truth'"):
+        Truth.load(tmp_path / "demos")
+
+
+def test_threads_are_left_as_they_were():
+    torch.set_num_threads(2)
+    try:
+        record_demonstrations("move", 3)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(1)
+
+
+MEASURE = """
+import time
+from ifo_grounding.data import record_demonstrations
+
+def memory(name):
+    lines = open("/proc/self/status").read().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(name)) * 1024
+
+record_demonstrations("pick-out", 10)
+before, begin = memory("VmRSS"), time.process_time()
+demos = record_demonstrations("pick-out", 80_000)
+print(time.process_time() - begin, memory("VmHWM") - before, demos.nbytes, demos.n_frames)
+"""
+
+
+def test_80000_demonstrations_are_recorded_in_seconds_and_150_mb():
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", MEASURE],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(SOURCE)},
+    )
+    seconds, peak, size, frames = map(float, run.stdout.split())
+    assert frames > 800_000
+    assert seconds < 30  # 4 s on an idle core; processors of shared machines are slower
+    assert peak < 150e6
+    assert size < 100e6
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(UserError, match="unknown task 'fly': choose one of 'move'"):
+        record_demonstrations("fly", 3)
+    with pytest.raises(UserError, match="unknown tile size 9"):
+        record_demonstrations("move", 3, tile_size=9)
+    with pytest.raises(UserError, match="number of demonstrations must be at least 1, got 0"):
+        record_demonstrations("move", 0)
+    with pytest.raises(UserError, match="unknown split 'most'"):
+        record_demonstrations("move", 3, split="most")

@@ -1,0 +1,169 @@
+"""Random transitions: what is taken, kept and stored."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torchrl.data import Categorical, OneHot
+from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
+
+from ifo_grounding.data import Collected, Demonstrations, RandomActions, collect_transitions
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.world import Layout
+
+
+def make_env(num_envs: int = 16, **options) -> PickAndPlaceEnv:
+    return PickAndPlaceEnv("pick", num_envs=num_envs, seed=0, **options)
+
+
+def unchanged(sample) -> torch.Tensor:
+    return (sample["pixels"] == sample["next", "pixels"]).flatten(1).all(1)
+
+
+def test_actions_explain_what_changed():
+    buffer, report = collect_transitions(make_env(), 2000, seed=1)
+    assert int(report.taken.sum()) == 2000
+    assert len(buffer) == int(report.kept.sum()) < 2000
+    everything = buffer[:]
+    action = everything["action"]
+    assert torch.equal(action.bincount(minlength=6), report.kept)
+    assert torch.equal(unchanged(everything), action == 5)
+    corners = (everything["pixels"][:, :, ::8, ::8] == 255).all(1).flatten(1).float().argmax(1)
+    after = everything["next", "pixels"][:, :, ::8, ::8]
+    moved = (after == 255).all(1).flatten(1).float().argmax(1) - corners
+    step = torch.tensor([-6, 1, 6, -1, 0, 0])
+    assert torch.equal(moved, step[action])
+
+
+def test_everything_is_kept_on_request():
+    env = make_env()
+    buffer, report = collect_transitions(env, 1500, drop_unchanged=False)
+    assert torch.equal(report.taken, report.kept)
+    everything = buffer[:]
+    bumps = unchanged(everything) & (everything["action"] != 5)
+    assert len(everything) == 1500 and 150 < bumps.sum() < 900
+
+
+def test_all_actions_are_equally_likely_by_default():
+    _, report = collect_transitions(make_env(), 3000)
+    assert (report.taken - 500).abs().max() < 90  # four standard deviations
+
+
+def test_the_stop_can_be_rare():
+    _, report = collect_transitions(make_env(), 3000, stop_probability=0.02)
+    assert abs(report.taken[5] - 60) < 31
+    assert (report.taken[:5] - 588).abs().max() < 90
+    _, report = collect_transitions(make_env(), 500, stop_probability=0.0)
+    assert report.taken[5] == 0
+    assert str(report).splitlines()[6].split() == ["5", "0", "0"]
+
+
+def test_another_action_can_be_the_stop():
+    buffer, report = collect_transitions(make_env(), 1500, stop_action=4)
+    everything = buffer[:]
+    assert report.kept[5] == 0 and report.kept[4] == report.taken[4]
+    assert not unchanged(everything)[everything["action"] != 4].any()
+
+
+def test_same_seeds_same_transitions():
+    first, second = (collect_transitions(make_env(), 300, seed=4).buffer[:] for _ in range(2))
+    other = collect_transitions(make_env(), 300, seed=5).buffer[:]
+    assert (first == second).all()
+    assert first.shape != other.shape or not torch.equal(first["action"], other["action"])
+
+
+def test_frames_are_stored_as_codes():
+    buffer, _ = collect_transitions(make_env(), 1000)
+    stored = buffer.storage.get(slice(None))
+    assert stored.bytes() * 50 < buffer[:].exclude("index").bytes()
+
+
+@pytest.mark.parametrize("n", [1, 5, 16, 37])
+def test_any_number_of_steps_is_taken_exactly(n):
+    _, report = collect_transitions(make_env(), n, drop_unchanged=False)
+    assert int(report.taken.sum()) == n
+
+
+def test_wrapped_environments_serve_too():
+    plain = lambda: PickAndPlaceEnv("move", num_envs=2, seed=0, instructed=False)  # noqa: E731
+    for env in (
+        TransformedEnv(plain(), Compose(StepCounter())),
+        SerialEnv(2, plain),
+    ):
+        buffer, _ = collect_transitions(env, 60, drop_unchanged=False)
+        everything = buffer[:]
+        assert everything.shape == (60,) and everything["pixels"].shape == (60, 3, 48, 48)
+        if isinstance(env, SerialEnv):
+            assert not env.is_closed
+            env.close()
+
+
+def test_the_buffer_takes_sampler_options():
+    buffer, _ = collect_transitions(
+        make_env(), 200, batch_size=7, generator=torch.Generator().manual_seed(0)
+    )
+    assert buffer.sample().shape == (7,)
+
+
+def test_more_transitions_can_be_added():
+    env = make_env()
+    buffer, _ = collect_transitions(env, 2000, stop_probability=0.02)
+    count = len(buffer)
+    more = buffer[:10].clone()
+    buffer.extend(more)
+    assert len(buffer) == count
+    assert torch.equal(buffer[:10]["pixels"], more["pixels"])
+
+
+def test_saved_transitions_are_the_same(tmp_path):
+    collected = collect_transitions(make_env(), 400)
+    collected.save(tmp_path / "t")
+    loaded = Collected.load(tmp_path / "t", batch_size=5)
+    assert (loaded.buffer[:] == collected.buffer[:]).all()
+    assert torch.equal(loaded.report.taken, collected.report.taken)
+    assert loaded.buffer.sample().shape == (5,)
+    with pytest.raises(UserError, match="holds 'ifo-grounding transitions', not"):
+        Demonstrations.load(tmp_path / "t")
+    (tmp_path / "t" / "action.npy").unlink()
+    with pytest.raises(UserError, match=r"action\.npy is missing"):
+        Collected.load(tmp_path / "t")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("pixels", lambda stored: stored["pixels"].fill_(120), "outside its dictionary"),
+        ("action", lambda stored: stored["action"].fill_(9), "unknown ones"),
+    ],
+)
+def test_saved_nonsense_is_refused(name, change, message, tmp_path):
+    collected = collect_transitions(make_env(), 50)
+    change(collected.buffer.storage._storage)
+    collected.save(tmp_path / "t")
+    with pytest.raises(UserError, match=message):
+        Collected.load(tmp_path / "t")
+
+
+def test_bad_input_is_refused():
+    env = make_env()
+    with pytest.raises(UserError, match="n must be at least 1"):
+        collect_transitions(env, 0)
+    with pytest.raises(UserError, match=r"stop_probability must be within 0\.\.1, got 2"):
+        collect_transitions(env, 10, stop_probability=2)
+    with pytest.raises(UserError, match=r"stop_action must be 0\.\.5, got 6"):
+        collect_transitions(env, 10, stop_action=6)
+    env.action_spec = OneHot(6, shape=(16, 6))
+    with pytest.raises(UserError, match="need one categorical action"):
+        collect_transitions(env, 10)
+    env.action_spec = Categorical(6, shape=(16,))
+    assert RandomActions(env).n_actions == 6
+
+
+def test_nothing_kept_is_said():
+    env = PickAndPlaceEnv("pick", num_envs=1, seed=0, layout=Layout(objects=(1, 1), boxes=(1, 1)))
+    always_pick = {"stop_action": 0, "stop_probability": 0.0}
+    taken = [RandomActions(env, **always_pick, seed=seed) for seed in range(40)]
+    picks = [policy(env.reset())["action"].item() == 4 for policy in taken]
+    with pytest.raises(UserError, match="none of 1 steps changed anything"):
+        collect_transitions(env, 1, seed=picks.index(True), **always_pick)

@@ -1,0 +1,517 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_checker import check_env as check_for_sb3
+from stable_baselines3.common.env_util import make_vec_env
+from torchrl.envs import GymEnv, GymWrapper, check_env_specs
+
+import ifo_grounding
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.envs.gymnasium_envs import PickAndPlaceGymEnv, PickAndPlaceVectorEnv
+from ifo_grounding.envs.window import LINE_HEIGHT
+from ifo_grounding.errors import UserError
+from ifo_grounding.keys import STOP
+from ifo_grounding.tasks import TASKS, VOCABULARY, expert
+from ifo_grounding.world import Layout, render
+
+IDS = dict(zip(("Move", "MoveUDLR", "Pick", "PickOut", "PickUDLR"), TASKS, strict=True))
+NAMES = {task: f"ifo_grounding/{name}-v0" for name, task in IDS.items()}
+UP = 0
+
+
+@pytest.fixture
+def no_warnings():
+    """Gymnasium warns through its own logger, which ends in warnings.warn."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def wise(env) -> np.ndarray:
+    """Actions of the expert."""
+    return expert.act(env.simulator.scene.state, env.simulator.scene.wanted).numpy()
+
+
+def finish(env) -> tuple[dict, float, bool, bool, dict]:
+    """Let the expert end an episode of one world."""
+    for _ in range(40):
+        step = env.step(int(wise(env)[0]))
+        if step[2] or step[3]:
+            return step
+    raise AssertionError("the expert did not stop")
+
+
+# --- registration --------------------------------------------------------------------------------
+
+
+def test_the_five_ids_are_registered_on_import():
+    ours = {name for name in gymnasium.registry if name.startswith("ifo_grounding/")}
+    assert ours == set(NAMES.values())
+    for name in ours:
+        assert gymnasium.spec(name).max_episode_steps is None  # the limit is the env's own
+
+
+def test_importing_the_package_is_cheap():
+    code = (
+        "import sys, ifo_grounding as p, gymnasium as g; "
+        "assert 'ifo_grounding/Move-v0' in g.registry; "
+        "sys.exit('torch' in sys.modules or 'pygame' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert ifo_grounding.__version__[0].isdigit()
+
+
+# --- one world -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_checks_pass_without_a_warning(task, no_warnings):
+    check_env(gymnasium.make(NAMES[task]).unwrapped)
+
+
+def test_the_checks_of_stable_baselines_pass(no_warnings):
+    check_for_sb3(gymnasium.make(NAMES["pick"]).unwrapped)
+
+
+def test_spaces_and_infos_are_as_described():
+    env = gymnasium.make(NAMES["pick-out"], tile_size=16)
+    pixels, instruction = env.observation_space["pixels"], env.observation_space["instruction"]
+    assert (pixels.shape, pixels.dtype) == ((3, 96, 96), np.uint8)
+    assert (instruction.shape, instruction.dtype) == ((16,), np.int64)
+    assert env.action_space == gymnasium.spaces.Discrete(6)
+    observation, info = env.reset(seed=0)
+    assert observation in env.observation_space
+    said = VOCABULARY.decode(torch.from_numpy(observation["instruction"]))
+    assert said == [info["instruction_text"]]
+    assert info.keys() == {"instruction_text"}
+
+
+def test_a_seed_starts_its_stream_and_resets_go_on():
+    env, other = gymnasium.make(NAMES["pick"]), gymnasium.make(NAMES["pick"])
+    first, second = env.reset(seed=3)[0], env.reset()[0]
+    assert not np.array_equal(first["pixels"], second["pixels"])
+    assert np.array_equal(other.reset(seed=3)[0]["pixels"], first["pixels"])
+    assert np.array_equal(other.reset()[0]["pixels"], second["pixels"])
+    assert np.array_equal(env.reset(seed=3)[0]["pixels"], first["pixels"])
+    assert not np.array_equal(env.reset(seed=4)[0]["pixels"], first["pixels"])
+
+
+def test_without_a_seed_envs_differ():
+    one, other = (gymnasium.make(NAMES["pick"]).reset()[0]["pixels"] for _ in range(2))
+    assert not np.array_equal(one, other)
+
+
+def test_the_seed_of_the_generator_decides_where_reset_names_none():
+    frames = []
+    for _ in range(2):
+        env = PickAndPlaceGymEnv("pick")
+        env.np_random = np.random.default_rng(7)
+        frames.append(env.reset()[0]["pixels"])
+    assert np.array_equal(*frames)
+
+
+def test_a_scene_can_be_asked_for():
+    env = gymnasium.make(NAMES["pick"])
+    env.reset(seed=0)
+    frames = [env.reset()[0]["pixels"] for _ in range(3)]
+    assert np.array_equal(env.reset(options={"scene": 2})[0]["pixels"], frames[1])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_expert_succeeds(task):
+    env = PickAndPlaceGymEnv(task)
+    env.reset(seed=0)
+    _, reward, terminated, truncated, info = finish(env)
+    assert (reward, terminated, truncated, info["is_success"]) == (1.0, True, False, True)
+
+
+def test_an_early_stop_and_a_late_one_fail():
+    env = gymnasium.make(NAMES["move"], max_steps=3)
+    env.reset(seed=0)
+    _, reward, terminated, truncated, info = env.step(STOP)
+    assert (reward, terminated, truncated, info["is_success"]) == (0.0, True, False, False)
+    env.reset()
+    for time_ in range(3):
+        _, reward, terminated, truncated, info = env.step(UP)
+        assert ("is_success" in info) == truncated == (time_ == 2)
+        assert (reward, terminated) == (0.0, False)
+
+
+def test_forty_actions_are_the_limit():
+    env = gymnasium.make(NAMES["pick"])
+    env.reset(seed=0)
+    ends = [env.step(UP)[3] for _ in range(40)]
+    assert ends == [False] * 39 + [True]
+
+
+def test_options_reach_the_world():
+    layout = Layout(size=4, objects=(2, 3), boxes=(2, 2))
+    env = gymnasium.make(
+        NAMES["pick"], layout=layout, split="zero-shot", holdout="pairs-1", stream="evaluation"
+    )
+    observation, info = env.reset(seed=0)
+    assert observation["pixels"].shape == (3, 32, 32)
+    assert "yellow circle" in info["instruction_text"]
+
+
+# --- pictures ------------------------------------------------------------------------------------
+
+
+def test_rgb_array_is_drawn_large():
+    env = gymnasium.make(NAMES["pick"], render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    assert (frame.shape, frame.dtype) == ((192, 192, 3), np.uint8)
+    expected = render(env.unwrapped.simulator.scene.state, 32)[0].permute(1, 2, 0).numpy()
+    assert np.array_equal(frame, expected)
+    before = frame.copy()
+    for action in (1, 2):
+        env.step(action)
+    assert not np.array_equal(env.render(), before)
+
+
+def test_a_window_shows_the_world_and_the_instruction(monkeypatch):
+    import pygame
+
+    env = PickAndPlaceGymEnv("pick", render_mode="human")
+    window = env._window
+    window.fps = 0  # do not wait
+    _, info = env.reset(seed=0)
+    for seed in (0, 1):
+        _, info = env.reset(seed=seed)
+        assert pygame.display.get_caption()[0] == info["instruction_text"]
+        shown = window.pixels()
+        assert shown.shape == (192 + LINE_HEIGHT, 192, 3)
+        world = render(env.simulator.scene.state, 32)[0].permute(1, 2, 0).numpy()
+        assert np.array_equal(shown[:192], world)
+        assert len(np.unique(shown[192:].reshape(-1, 3), axis=0)) > 10  # letters
+    before = window.pixels().copy()
+    env.step(1)
+    env.step(2)
+    assert not np.array_equal(window.pixels(), before)
+    assert env.render() is None
+    env.close()
+    assert not pygame.display.get_init()
+    env.reset()  # opens again
+    env.close()
+    env.close()
+
+
+@pytest.mark.parametrize("driver", [None, "x11"])
+def test_a_window_needs_no_screen(monkeypatch, driver):
+    for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.setenv(name, driver or "")  # so that it is put back as it was
+        if name != "SDL_VIDEODRIVER" or driver is None:
+            monkeypatch.delenv(name)
+    env = PickAndPlaceGymEnv("move", render_mode="human")
+    env.reset(seed=0)
+    assert env._window.pixels().any()
+    env.close()
+
+
+def test_a_missing_pygame_is_explained(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(gymnasium.error.DependencyNotInstalled, match=r"ifo-grounding\[human\]"):
+        PickAndPlaceGymEnv("move", render_mode="human")
+
+
+# --- many worlds ---------------------------------------------------------------------------------
+
+
+def test_make_vec_is_native(no_warnings):
+    envs = gymnasium.make_vec(NAMES["pick"], num_envs=5)
+    assert isinstance(envs, PickAndPlaceVectorEnv)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    observations, infos = envs.reset(seed=0)
+    assert observations in envs.observation_space
+    assert envs.single_observation_space == gymnasium.make(NAMES["pick"]).observation_space
+    assert envs.action_space.shape == (5,)
+    said = VOCABULARY.decode(torch.from_numpy(observations["instruction"]))
+    assert infos["instruction_text"].tolist() == said
+    assert infos["_instruction_text"].all()
+
+
+def test_make_vec_is_fast():
+    """Batched: a step of 256 worlds costs less than that of 16 worlds in a loop."""
+    many = gymnasium.make_vec(NAMES["pick"], num_envs=256)
+    few = gymnasium.make_vec(NAMES["pick"], num_envs=16, vectorization_mode="sync")
+    seconds = []
+    for envs in (many, few):
+        envs.reset(seed=0)
+        actions = np.full(envs.num_envs, UP)
+        envs.step(actions)
+        spent = []
+        for _ in range(5):
+            start = time.perf_counter()
+            envs.step(actions)
+            spent.append(time.perf_counter() - start)
+        seconds.append(min(spent))
+    assert seconds[0] < seconds[1]
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize("task", ["move", "pick-out"])
+def test_one_world_many_worlds_and_torchrl_agree(task, mode):
+    """The same scenes and actions give the same pixels, words, rewards and ends in all three."""
+    n = 6
+    batch = PickAndPlaceEnv(task, n, seed=9, max_steps=9)
+    envs = gymnasium.make_vec(NAMES[task], num_envs=n, autoreset_mode=mode, max_steps=9)
+    singles = [gymnasium.make(NAMES[task], max_steps=9) for _ in range(n)]
+    td = batch.reset()
+    observations, infos = envs.reset(seed=9)
+    for number, env in enumerate(singles):
+        env.reset(seed=9)
+        single, info = env.reset(options={"scene": number})
+        assert np.array_equal(single["pixels"], observations["pixels"][number])
+        assert info["instruction_text"] == infos["instruction_text"][number]
+    assert np.array_equal(td["pixels"].numpy(), observations["pixels"])
+    assert np.array_equal(td["instruction"].numpy(), observations["instruction"])
+
+    draw = np.random.default_rng(0)
+    over, success = np.zeros(n, bool), 0.0
+    while not over.all():
+        actions = np.where(draw.random(n) < 0.15, draw.integers(0, 6, n), wise(batch))
+        live = ~over
+        td = batch.step(td.set("action", torch.from_numpy(actions)))["next"].exclude("reward")
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        last = infos.get("final_obs") if mode is AutoresetMode.SAME_STEP else None
+        for row in np.flatnonzero(live):
+            single, paid, end, late, info = singles[row].step(int(actions[row]))
+            assert (paid, end, late) == (rewards[row], terminated[row], truncated[row])
+            seen = {name: value[row] for name, value in observations.items()}
+            if (end or late) and last is not None:
+                seen, infos_row = last[row], infos["final_info"]
+                assert infos["_final_obs"][row]
+                assert infos["_final_info"][row]
+            else:
+                infos_row = infos
+            assert np.array_equal(single["pixels"], seen["pixels"])
+            assert np.array_equal(single["instruction"], seen["instruction"])
+            assert np.array_equal(single["pixels"], td["pixels"][row].numpy())
+            assert info["instruction_text"] == infos_row["instruction_text"][row]
+            assert bool(td["done"][row]) == (end or late)
+            if end or late:
+                assert info["is_success"] == infos_row["is_success"][row] == bool(paid)
+                assert infos_row["_is_success"][row]
+            else:
+                assert "is_success" not in infos_row or not infos_row["_is_success"][row]
+            success += paid
+        over |= terminated | truncated
+        if mode is AutoresetMode.DISABLED and (terminated | truncated).any():
+            envs.reset(options={"reset_mask": terminated | truncated})
+    assert success > 0
+
+
+def test_next_step_autoreset_takes_a_step_of_its_own():
+    envs = gymnasium.make_vec(NAMES["move"], num_envs=3)
+    first, _ = envs.reset(seed=0)
+    ended, rewards, terminated, _, infos = envs.step(np.array([STOP, UP, STOP]))
+    assert terminated.tolist() == [True, False, True]
+    assert infos["_is_success"].tolist() == [True, False, True]
+    assert np.array_equal(ended["pixels"][0], first["pixels"][0])
+    # The action of an ended world is not looked at: it would stop the new episode.
+    fresh, rewards, terminated, truncated, infos = envs.step(np.array([STOP, UP, STOP]))
+    assert not (rewards.any() or terminated.any() or truncated.any())
+    assert "is_success" not in infos
+    stream = PickAndPlaceEnv("move", 5, seed=0).reset()["pixels"].numpy()
+    assert np.array_equal(fresh["pixels"][[0, 2]], stream[[3, 4]])
+    said = VOCABULARY.decode(torch.from_numpy(fresh["instruction"]))
+    assert infos["instruction_text"].tolist() == said
+    assert envs.step(np.array([STOP, UP, UP]))[2].tolist() == [True, False, False]
+
+
+def test_same_step_autoreset_keeps_the_last_observation():
+    envs = gymnasium.make_vec(NAMES["move"], num_envs=3, autoreset_mode="SameStep")
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    first, start = envs.reset(seed=0)
+    fresh, _, terminated, _, infos = envs.step(np.array([UP, STOP, UP]))
+    assert terminated.tolist() == [False, True, False]
+    assert infos["_final_obs"].tolist() == [False, True, False]
+    assert infos["final_obs"][0] is None
+    assert np.array_equal(infos["final_obs"][1]["pixels"], first["pixels"][1])
+    assert infos["final_info"]["is_success"].tolist() == [False, False, False]
+    assert infos["final_info"]["_is_success"].tolist() == [False, True, False]
+    assert infos["final_info"]["instruction_text"][1] == start["instruction_text"][1]
+    stream = PickAndPlaceEnv("move", 4, seed=0).reset()["pixels"].numpy()
+    assert np.array_equal(fresh["pixels"][1], stream[3])
+    assert "is_success" not in infos
+    assert "final_obs" not in envs.step(np.array([UP, UP, UP]))[4]
+
+
+def test_without_autoreset_the_caller_resets():
+    envs = gymnasium.make_vec(NAMES["move"], num_envs=3, autoreset_mode=AutoresetMode.DISABLED)
+    before, _ = envs.reset(seed=0)
+    envs.step(np.array([STOP, UP, STOP]))
+    with pytest.raises(UserError, match="2 worlds have ended"):
+        envs.step(np.array([UP, UP, UP]))
+    mask = np.array([True, False, True])
+    fresh, infos = envs.reset(options={"reset_mask": mask})
+    assert infos["_instruction_text"].tolist() == mask.tolist()
+    stream = PickAndPlaceEnv("move", 5, seed=0).reset()["pixels"].numpy()
+    assert np.array_equal(fresh["pixels"][[0, 2]], stream[[3, 4]])
+    assert np.array_equal(fresh["instruction"][1], before["instruction"][1])
+    assert not envs.step(np.array([UP, UP, UP]))[2].any()
+
+
+def test_infos_equal_those_of_gymnasium_s_own_vectorizer():
+    modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+    for mode in modes:
+        native = gymnasium.make_vec(NAMES["move"], 2, autoreset_mode=mode)
+        loop = gymnasium.make_vec(NAMES["move"], 2, "sync", vector_kwargs={"autoreset_mode": mode})
+        formats = []
+        for envs in (native, loop):
+            seen = [shape(envs.reset(seed=0)[1])]
+            for actions in ([STOP, UP], [UP, UP], [UP, STOP]):
+                result = envs.step(np.array(actions))
+                seen.append((shape(result[4]), *(part.dtype for part in result[1:4])))
+            formats.append(seen)
+        assert formats[0] == formats[1]
+
+
+def shape(infos: dict) -> dict:
+    """Keys, types and masks of infos; their scenes differ."""
+    return {
+        key: shape(value)
+        if isinstance(value, dict)
+        else (value.dtype, value.tolist() if key.startswith("_") else None)
+        for key, value in infos.items()
+    }
+
+
+def test_scenes_can_be_asked_for_in_a_vector():
+    envs = gymnasium.make_vec(NAMES["pick"], num_envs=3)
+    first, _ = envs.reset(seed=0)
+    again, _ = envs.reset(options={"scene": np.array([2, 0, 0])})
+    assert np.array_equal(again["pixels"], first["pixels"][[2, 0, 0]])
+
+
+def test_observations_and_infos_are_new_at_every_call():
+    envs = gymnasium.make_vec(NAMES["pick"], num_envs=3)
+    kept, infos = envs.reset(seed=0)
+    copies = {name: value.copy() for name, value in kept.items()}
+    texts = infos["instruction_text"].copy()
+    for _ in range(3):
+        envs.step(np.array([STOP, UP, STOP]))
+    assert all(np.array_equal(kept[name], copies[name]) for name in kept)
+    assert infos["instruction_text"].tolist() == texts.tolist()
+
+
+def test_a_vector_can_be_drawn():
+    envs = gymnasium.make_vec(NAMES["pick"], num_envs=2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    frames = envs.render()
+    assert isinstance(frames, tuple)
+    assert [frame.shape for frame in frames] == [(192, 192, 3)] * 2
+
+
+def test_gymnasium_s_vector_wrappers_work():
+    envs = RecordEpisodeStatistics(gymnasium.make_vec(NAMES["move"], num_envs=4))
+    envs.reset(seed=0)
+    for _ in range(30):
+        envs.step(wise(envs.unwrapped))
+    assert len(envs.return_queue) >= 4
+    assert set(envs.return_queue) == {1.0}
+
+
+# --- other libraries -----------------------------------------------------------------------------
+
+
+def test_stable_baselines_trains_on_the_dict():
+    envs = make_vec_env(NAMES["move"], n_envs=2, seed=0)
+    model = PPO("MultiInputPolicy", envs, n_steps=64, batch_size=64, n_epochs=2, seed=0)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.learn(256)
+    after = model.policy.state_dict()
+    changed = [name for name in before if not torch.equal(before[name], after[name])]
+    assert any("cnn" in name for name in changed)
+    assert any("action_net" in name for name in changed)
+    assert len(model.ep_success_buffer) > 5  # it found info["is_success"]
+    action, _ = model.predict(envs.reset())
+    assert action.shape == (2,)
+
+
+def test_torchrl_wraps_one_world():
+    env = GymEnv(NAMES["move"])
+    check_env_specs(env)
+    rollout = env.rollout(50)
+    assert rollout["pixels"].shape[1:] == (3, 48, 48)
+    assert rollout["next", "done"][-1].item()
+
+
+def test_torchrl_wraps_many_worlds():
+    # The mode that TorchRL prefers: it resets by itself.
+    envs = gymnasium.make_vec(NAMES["move"], 3, autoreset_mode=AutoresetMode.DISABLED)
+    env = GymWrapper(envs)
+    assert env.batch_size == torch.Size([3])
+    rollout = env.rollout(60, break_when_any_done=False)
+    assert rollout["next", "done"].sum() >= 3
+    assert rollout["next", "pixels"].shape == (3, 60, 3, 48, 48)
+
+
+# --- mistakes ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [PickAndPlaceGymEnv, PickAndPlaceVectorEnv])
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"task": "fly"}, "unknown task 'fly'"),
+        ({"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
+        ({"render_mode": "ascii"}, "unknown render mode 'ascii'"),
+        ({"split": "x"}, "unknown split 'x'"),
+        ({"max_steps": 0}, "max_steps must be positive"),
+    ],
+)
+def test_bad_arguments_are_refused(kind, wrong, said):
+    with pytest.raises(UserError, match=said):
+        kind(**wrong)
+
+
+@pytest.mark.parametrize("kind", [PickAndPlaceGymEnv, PickAndPlaceVectorEnv])
+def test_unknown_arguments_are_refused(kind):
+    with pytest.raises(TypeError, match="argument 'instructed': scene options are holdout, "):
+        kind(instructed=False)
+
+
+def test_bad_vector_arguments_are_refused():
+    with pytest.raises(UserError, match="num_envs must be at least 1"):
+        PickAndPlaceVectorEnv(num_envs=0)
+    with pytest.raises(UserError, match="unknown autoreset mode 'x': choose one of 'NextStep'"):
+        PickAndPlaceVectorEnv(autoreset_mode="x")
+    with pytest.raises(UserError, match="unknown render mode 'human'"):
+        PickAndPlaceVectorEnv(render_mode="human")
+
+
+def test_bad_calls_are_refused():
+    env, envs = PickAndPlaceGymEnv("move"), PickAndPlaceVectorEnv("move", 2)
+    for call in (lambda: env.step(0), lambda: envs.step(np.array([0, 0]))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+            call()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="render"):
+        PickAndPlaceGymEnv("move", render_mode="rgb_array").render()
+    env.reset(seed=0)
+    envs.reset(seed=0)
+    for action in (6, -1, 0.5, [0, 0]):
+        with pytest.raises(UserError, match=r"integers 0\.\.5"):
+            env.step(action)
+    for actions in ([0, 6], [0], [[0], [0]], [0.0, 1.0]):
+        with pytest.raises(UserError, match="one for each of 2 worlds"):
+            envs.step(np.array(actions))
+    with pytest.raises(UserError, match="unknown reset option 'seen': choose one of 'scene'"):
+        env.reset(options={"seen": 3})
+    with pytest.raises(UserError, match="one for each of 1 worlds"):
+        env.reset(options={"scene": [3, 4]})
+    with pytest.raises(UserError, match=r"reset_mask'\] must be bool \[2\]"):
+        envs.reset(options={"reset_mask": np.array([True])})

@@ -1,0 +1,41 @@
+"""Policies that know the truth, to measure the measuring."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from ifo_grounding.tasks import SceneOptions, SceneStream, expert
+from ifo_grounding.world import WorldState
+
+
+class Expert:
+    """Follows shortest paths; needs an env with ``expose_state=True``."""
+
+    def __init__(self, task: str, seed: int = 0, stream: str = "evaluation") -> None:
+        self.scenes = SceneStream(SceneOptions(task, stream=stream), seed)
+        self.rows_asked = 0
+
+    def __call__(self, td: TensorDictBase) -> TensorDictBase:
+        """Write the next action."""
+        self.rows_asked += len(td)
+        state = WorldState(**dict(td["state"].items()), batch_size=td.batch_size)
+        wanted = self.scenes.scenes(td["scene"].squeeze(-1)).wanted
+        return td.set("action", expert.act(state, wanted))
+
+    def steps(self, episodes: int) -> torch.Tensor:
+        """Lengths of the shortest solutions."""
+        return self.scenes.scenes(torch.arange(episodes)).wanted.steps
+
+
+@pytest.fixture
+def make_expert():
+    """Give the class."""
+    return Expert
+
+
+@pytest.fixture
+def random_policy():
+    """Draw actions uniformly."""
+    return lambda td: td.set("action", torch.randint(6, td.shape))

@@ -1,0 +1,47 @@
+"""Recorded episodes are those that the success rate counts."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ifo_grounding.evaluation import record_episodes, success_rate
+from ifo_grounding.tasks import grammar
+
+
+def test_frames_actions_and_outcome_belong_together(make_expert):
+    expert = make_expert("pick-out")
+    numbers = [3, 11, 4]
+    episodes = record_episodes(expert, "pick-out", numbers, expose_state=True)
+    assert [episode.scene for episode in episodes] == numbers
+    steps = expert.steps(12)
+    for episode in episodes:
+        assert len(episode.actions) == steps[episode.scene]
+        assert episode.frames.shape == (len(episode.actions) + 1, 3, 48, 48)
+        assert episode.frames.dtype == np.uint8
+        # The expert wastes no step, so that frames change until the stop repeats the last one.
+        changes = (episode.frames[1:] != episode.frames[:-1]).any((1, 2, 3))
+        assert changes[:-1].all() and not changes[-1]
+        assert episode.actions[-1] == 5 and episode.stopped and episode.success
+        grammar("pick-out").parse(episode.sentence)
+
+
+def test_outcomes_agree_with_the_success_rate():
+    def up(td):
+        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
+
+    outcomes = success_rate(up, "move", episodes=100).outcomes
+    episodes = record_episodes(up, "move", range(100))
+    assert [episode.success for episode in episodes] == outcomes.tolist()
+    assert any(outcomes) and not any(episode.stopped for episode in episodes)
+
+
+def test_frames_for_people_are_larger(random_policy):
+    small = record_episodes(random_policy, "move", [0])[0]
+    large = record_episodes(random_policy, "move", [0], render_tile_size=32)[0]
+    assert large.frames.shape[1:] == (3, 192, 192)
+    assert large.sentence == small.sentence
+
+
+def test_no_scenes_no_episodes(random_policy):
+    assert record_episodes(random_policy, "move", []) == []

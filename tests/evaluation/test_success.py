@@ -1,0 +1,227 @@
+"""Success is what it says: one episode per fixed scene."""
+
+from __future__ import annotations
+
+import hashlib
+
+import pytest
+import torch
+from torch import nn
+from torchrl.envs import RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import ExplorationType, RandomPolicy, exploration_type
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import compare_success, success_rate
+from ifo_grounding.networks import make_policy
+from ifo_grounding.tasks import TASKS
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_expert_always_succeeds_on_shortest_paths(task, make_expert):
+    expert = make_expert(task)
+    result = success_rate(expert, task, episodes=600, batch_size=250, expose_state=True)
+    assert result.rate.rate == 1.0 and result.rate.count == 600
+    assert result.stopped.rate == 1.0
+    assert torch.equal(result.lengths, expert.steps(600))
+
+
+def test_random_actions_rarely_succeed(random_policy):
+    result = success_rate(random_policy, "move", mode="sampled", episodes=1000)
+    assert 0.0 < result.rate.rate < 0.05
+    # 1/6 stops at each of 40 steps, so that 1 - (5/6)^40 = 99.93% of the episodes stop.
+    assert result.stopped.rate > 0.99
+    assert result.lengths.double().mean().item() == pytest.approx(6.0, abs=0.6)
+
+
+def test_never_stopping_fails_at_the_step_limit():
+    def up(td):
+        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
+
+    result = success_rate(up, "move", episodes=200)
+    assert (result.lengths == 40).all() and result.stopped.successes == 0
+    # Success counts at the limit too: in scenes where going up ends on the object.
+    assert 0 < result.rate.successes < 20
+    short = success_rate(up, "move", episodes=200, max_steps=3)
+    assert (short.lengths == 3).all()
+
+
+def test_the_policy_is_asked_for_running_episodes_only(make_expert):
+    expert = make_expert("pick")
+    result = success_rate(expert, "pick", episodes=300, batch_size=128, expose_state=True)
+    # 300 = 128 + 128 + 44: the last batch is filled with copies of its first scene.
+    copies = 84 * int(result.lengths[256])
+    assert expert.rows_asked == int(result.lengths.sum()) + copies
+
+
+def test_scenes_depend_on_seed_and_stream_alone(make_expert, random_policy):
+    def scenes(policy, **options):
+        return success_rate(policy, "move", episodes=90, **options).scenes
+
+    same = scenes(random_policy)
+    assert same == scenes(random_policy, batch_size=40, mode="sampled")
+    assert same == scenes(make_expert("move"), expose_state=True)
+    others = {scenes(random_policy, seed=1), scenes(random_policy, stream="validation")}
+    assert len({same, *others}) == 3
+
+
+def test_scene_hash_by_hand(random_policy):
+    env = PickAndPlaceEnv("pick-udlr", num_envs=70, seed=4, stream="validation")
+    start = env.reset()
+    pixels = hashlib.blake2b(start["pixels"].numpy().tobytes()).digest()
+    words = hashlib.blake2b(start["instruction"].numpy().tobytes()).digest()
+    result = success_rate(
+        random_policy, "pick-udlr", episodes=70, batch_size=32, seed=4, stream="validation"
+    )
+    assert result.scenes == hashlib.blake2b(pixels + words, digest_size=8).hexdigest()
+
+
+def test_short_episodes_are_not_favoured(make_expert):
+    # Half of the scenes are given up at once: "the first 200 finished" would mostly be those.
+    expert = make_expert("pick-out")
+
+    def half(td):
+        action = expert(td)["action"]
+        return td.set("action", torch.where(td["scene"].squeeze(-1) % 2 == 0, action, 5))
+
+    result = success_rate(half, "pick-out", episodes=400, expose_state=True, batch_size=100)
+    assert result.outcomes[0::2].all() and not result.outcomes[1::2].any()
+    assert (result.lengths[1::2] == 1).all()
+    assert result.rate.rate == 0.5
+
+
+@pytest.fixture(scope="module")
+def policy():
+    """An untrained policy with dropout."""
+    return make_policy(PickAndPlaceEnv("move", num_envs=1, seed=0), "paper", seed=0)
+
+
+def test_greedy_and_sampled_are_reproducible_and_differ(policy):
+    options = {"episodes": 60, "max_steps": 12}
+    both = success_rate(policy, "move", mode="both", **options)
+    assert (both.mode, both.sampled.mode) == ("greedy", "sampled")
+    assert both.scenes == both.sampled.scenes
+    again = success_rate(policy, "move", mode="both", **options)
+    assert torch.equal(both.lengths, again.lengths)
+    assert torch.equal(both.sampled.lengths, again.sampled.lengths)
+    other = success_rate(policy, "move", mode="sampled", seed=1, **options)
+    assert not torch.equal(both.sampled.lengths, other.lengths)
+    assert both.as_dict()["sampled"]["mode"] == "sampled"
+
+
+def test_greedy_takes_the_likeliest_action_whatever_the_batch(policy):
+    seen = []
+
+    def spy(td):
+        seen.append(exploration_type())
+        td = policy(td)
+        assert torch.equal(td["action"], td["logits"].argmax(-1))
+        return td
+
+    first = success_rate(spy, "move", episodes=60, max_steps=12)
+    second = success_rate(policy, "move", episodes=60, max_steps=12, batch_size=25)
+    assert torch.equal(first.outcomes, second.outcomes)
+    assert torch.equal(first.lengths, second.lengths)
+    assert set(seen) == {ExplorationType.DETERMINISTIC}
+
+
+def test_modes_gradients_and_random_numbers_are_left_as_they_were(policy):
+    policy.train()
+    still = next(part for part in policy.modules() if isinstance(part, nn.Dropout))
+    still.eval()
+    before = [part.training for part in policy.modules()]
+
+    def check(td):
+        assert not any(part.training for part in policy.modules())
+        assert not torch.is_grad_enabled()
+        return policy(td)
+
+    class Checked(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.policy = policy
+
+        def forward(self, td):
+            return check(td)
+
+    torch.manual_seed(7)
+    expected = torch.rand(1)
+    torch.manual_seed(7)
+    success_rate(Checked(), "move", episodes=20, mode="sampled", max_steps=3)
+    assert torch.rand(1) == expected
+    assert [part.training for part in policy.modules()] == before
+    policy.eval()
+
+
+def test_modes_come_back_when_a_policy_fails(policy):
+    policy.train()
+
+    class Broken(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.policy = policy
+
+        def forward(self, td):
+            raise RuntimeError("broken")
+
+    with pytest.raises(RuntimeError, match="broken"):
+        success_rate(Broken(), "move", episodes=2)
+    assert policy.training and torch.is_grad_enabled()
+    policy.eval()
+
+
+def test_a_users_own_environment(random_policy):
+    env = TransformedEnv(
+        PickAndPlaceEnv("move", num_envs=32, seed=9), StepCounter()
+    ).append_transform(RewardSum())
+    first = success_rate(random_policy, env, episodes=80, mode="sampled")
+    second = success_rate(RandomPolicy(env.action_spec), env, episodes=80, mode="sampled")
+    assert first.rate.count == 80
+    # Neither the policy nor what the environment did before changes the scenes.
+    assert first.scenes == second.scenes
+    assert first.scenes != success_rate(random_policy, env, episodes=80, seed=1).scenes
+
+
+def test_environments_of_other_batch_shapes():
+    env = SerialEnv(3, lambda: PickAndPlaceEnv("move", num_envs=2, seed=0))
+    seen = set()
+
+    def stop(td):
+        seen.update(picture.numpy().tobytes() for picture in td["pixels"])
+        return td.set("action", torch.full(td.shape, 5))
+
+    result = success_rate(stop, env, episodes=10)
+    assert result.outcomes.shape == (10,)
+    # 12 rows of 2 batches: every worker has scenes of its own.
+    assert len(seen) == 12
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda p: success_rate(p, "fly"), "unknown task 'fly'"),
+        (lambda p: success_rate(p, "move", mode="best"), "unknown mode 'best'"),
+        (lambda p: success_rate(p, "move", stream="test"), "unknown stream 'test'"),
+        (lambda p: success_rate(p, "move", episodes=0), "must be positive"),
+        (lambda p: success_rate(p, PickAndPlaceEnv(instructed=False)), "instructed"),
+        (lambda p: success_rate(p, PickAndPlaceEnv(), tile_size=8), "tile_size"),
+    ],
+)
+def test_mistakes_get_one_clear_line(call, message, random_policy):
+    with pytest.raises(UserError, match=message):
+        call(random_policy)
+
+
+def test_comparison_is_paired_and_refuses_other_scenes(make_expert, random_policy):
+    expert = make_expert("move")
+    worse = success_rate(random_policy, "move", episodes=100)
+    better = success_rate(expert, "move", episodes=100, expose_state=True)
+    difference = compare_success(worse, better)
+    assert difference.points == pytest.approx(100 * (1 - worse.rate.rate))
+    assert difference.worse == 0 and difference.low > 80
+    other = success_rate(random_policy, "move", episodes=100, seed=1)
+    with pytest.raises(UserError, match="different scenes"):
+        compare_success(worse, other)
+    sampled = success_rate(random_policy, "move", episodes=100, mode="sampled")
+    with pytest.raises(UserError, match="cannot compare"):
+        compare_success(worse, sampled)

@@ -1,0 +1,156 @@
+"""The suitable rate, measured on classifiers whose quality is known."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import judged_choices, suitable_rate
+from ifo_grounding.evaluation.suitability import entropy_bits
+from ifo_grounding.networks import make_instruction_classifier
+from ifo_grounding.tasks import REASONS, SceneOptions, SceneStream, grammar, verdict
+from ifo_grounding.world import render
+
+
+def as_classifier(function):
+    """Wrap a function of (pixels, instruction) that returns logits [B]."""
+    return TensorDictModule(
+        lambda pixels, instruction: function(pixels, instruction).float().unsqueeze(-1),
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+
+
+def oracle(task, states, flip=0.0):
+    """A classifier that recognises the fresh states by their pictures and asks the truth."""
+    state = (
+        SceneStream(SceneOptions(task, instructed=False, stream="evaluation"), 0)
+        .scenes(torch.arange(states))
+        .state
+    )
+    numbers = {picture.numpy().tobytes(): row for row, picture in enumerate(render(state, 8))}
+    lies = torch.Generator().manual_seed(1)
+
+    def judge(pixels, instruction):
+        rows = torch.tensor([numbers[picture.numpy().tobytes()] for picture in pixels])
+        right = verdict(state[rows], grammar(task).parse_tokens(instruction)) == 0
+        wrong = torch.rand(len(rows), generator=lies) < flip
+        return torch.where(right != wrong, 6.0, -6.0)
+
+    return as_classifier(judge)
+
+
+def yes():
+    """A classifier that finds everything suitable."""
+    return as_classifier(lambda pixels, instruction: torch.full((len(pixels),), 9.0))
+
+
+@pytest.mark.parametrize("task", ["move", "pick-udlr"])
+def test_the_oracle_is_perfect(task):
+    pool = grammar(task).tokens
+    result = suitable_rate(oracle(task, 300), task, pool, states=300, batch_size=128)
+    assert result.rate.rate == 1.0
+    assert (result.precision.rate, result.recall.rate, result.auc.value) == (1.0, 1.0, 1.0)
+    assert sum(result.errors.values()) == 0
+    assert result.served.count == 300 and result.rate.count == result.served.successes
+    assert 0.0 < result.base_rate.rate < 0.6
+    assert json.loads(json.dumps(result.as_dict(), allow_nan=False))["rate"]["rate"] == 1.0
+
+
+def test_errors_are_counted_by_kind():
+    pool = ["go to the cell above the red circle"]
+    result = suitable_rate(yes(), "move-udlr", pool, states=2000, pairs_per_state=0)
+    scenes = SceneStream(SceneOptions("move-udlr", instructed=False, stream="evaluation"), 0)
+    state = scenes.scenes(torch.arange(2000)).state
+    goal = grammar("move-udlr").parse(pool)[torch.zeros(2000, dtype=torch.int64)]
+    counts = verdict(state, goal).bincount(minlength=len(REASONS)).tolist()
+    assert result.rate.successes == counts[0] > 0
+    assert result.errors == dict(zip(REASONS[1:], counts[1:], strict=True))
+    for reason in ("missing", "ambiguous", "out of bounds", "occupied", "already true"):
+        assert result.errors[reason] > 0, reason
+    assert result.precision.count == 0 and math.isnan(result.auc.value)
+
+
+def test_precision_and_recall_of_a_noisy_judge():
+    # One in ten judgements is wrong; b is the share of suitable pairs.
+    pool = grammar("move").tokens
+    result = suitable_rate(oracle("move", 1000, flip=0.1), "move", pool, states=1000)
+    b = result.base_rate.rate
+    assert result.recall.low < 0.9 < result.recall.high
+    expected = 0.9 * b / (0.9 * b + 0.1 * (1 - b))
+    assert result.precision.low < expected < result.precision.high
+    assert result.auc.low < 0.9 < result.auc.high
+
+
+def test_choosing_at_random_gives_the_base_rate():
+    pool = grammar("move").tokens
+    result = suitable_rate(yes(), "move", pool, states=2000)
+    assert result.served.rate == 1.0
+    assert result.rate.low < result.base_rate.high and result.rate.high > result.base_rate.low
+    # Twelve goals equally often: log2(12) = 3.585 bits.
+    assert result.most_entropy == pytest.approx(math.log2(12))
+    assert result.entropy == pytest.approx(math.log2(12), abs=0.02)
+
+
+def test_wordings_of_one_goal_are_one_goal():
+    pool = [s for s in grammar("pick").sentences if "red circle" in s and "orange" in s]
+    assert len(pool) == 12
+    result = suitable_rate(yes(), "pick", pool, states=50)
+    assert result.entropy == result.most_entropy == 0.0
+
+
+def test_nothing_above_the_threshold():
+    no = as_classifier(lambda pixels, instruction: torch.full((len(pixels),), -9.0))
+    result = suitable_rate(no, "move", grammar("move").tokens, states=100)
+    assert result.served.successes == 0 and result.rate.count == 0
+    assert str(result) == "undefined (n=0)"
+    assert result.recall.rate == 0.0 and result.entropy == 0.0
+
+
+def test_a_real_classifier_and_its_reproducibility():
+    env = PickAndPlaceEnv("move", num_envs=1, seed=0)
+    classifier = make_instruction_classifier(env, "paper", seed=0).train()
+    options = {"states": 200, "threshold": 0.4, "candidates": 5}
+    first = suitable_rate(classifier, "move", grammar("move").tokens, **options)
+    assert first == suitable_rate(classifier, "move", grammar("move").tokens, **options)
+    assert classifier.training
+    assert first.precision.count > 0
+
+
+def test_choices_to_look_at_are_those_that_count():
+    pool = grammar("move").tokens
+    judged = judged_choices(yes(), "move", pool, states=64)
+    result = suitable_rate(yes(), "move", pool, states=64, pairs_per_state=0)
+    assert int((judged.verdict == 0).sum()) == result.rate.successes
+    goals = grammar("move").goals[judged.chosen]
+    assert torch.equal(verdict(judged.state, goals), judged.verdict)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"states": 0}, "states must be positive"),
+        ({"pool": []}, "pool is empty"),
+        ({"pool": ["put the red circle in the orange box"]}, "no sentence of move"),
+        ({"task": "fly"}, "unknown task"),
+        ({"threshold": 1.5}, "threshold"),
+        ({"choose": "worst"}, "unknown choose"),
+    ],
+)
+def test_mistakes_get_one_clear_line(options, message):
+    arguments = {"task": "move", "pool": ["move to the red circle"], "states": 10, **options}
+    with pytest.raises(UserError, match=message):
+        suitable_rate(yes(), **arguments)
+
+
+def test_entropy_by_hand():
+    assert entropy_bits(torch.tensor([1, 1, 1, 2])) == pytest.approx(
+        0.75 * math.log2(4 / 3) + 0.25 * 2
+    )
+    assert entropy_bits(torch.tensor([5, 5])) == 0.0

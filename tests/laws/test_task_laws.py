@@ -1,0 +1,129 @@
+"""What holds for every goal in every scene."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ifo_grounding.tasks import (
+    N_TEMPLATES,
+    PHRASINGS,
+    REASONS,
+    TASKS,
+    VOCABULARY,
+    SceneOptions,
+    SceneStream,
+    achieved,
+    grammar,
+    plan,
+    suitable,
+    verdict,
+)
+from ifo_grounding.tasks.expert import act
+from ifo_grounding.world import Layout, random_layout, step
+from ifo_grounding.world.dynamics import STOP
+from reference import draw_goal, holds, judge, plain, wishes
+
+law = settings(max_examples=40, deadline=None, derandomize=True)
+ROWS = 16
+tasks = st.sampled_from(TASKS)
+
+
+@st.composite
+def asked(draw):
+    """A task, scenes [16], and goals [16] of it, most of them unsuitable."""
+    task, seed = draw(tasks), draw(st.integers(0, 2**31))
+    size = draw(st.integers(3, 10))
+    most = min(size * size - 4, 14)
+    low = draw(st.integers(1, most))
+    layout = Layout(size=size, objects=(low, draw(st.integers(low, most))), boxes=(0, 4))
+    state = random_layout(ROWS, layout, generator=torch.Generator().manual_seed(seed))
+    return task, state, draw_goal(task, state, seed, present=draw(st.floats(0, 1)))
+
+
+@law
+@given(asked(), st.integers(1, 45))
+def test_verdicts_are_those_of_the_plain_rules(asked, max_steps):
+    _, state, goal = asked
+    found = [REASONS[number] for number in verdict(state, goal, max_steps).tolist()]
+    pairs = zip(plain(state), wishes(goal), strict=True)
+    assert found == [judge(world, wish, max_steps) for world, wish in pairs]
+    assert suitable(state, goal, max_steps).tolist() == [reason == "suitable" for reason in found]
+
+
+@law
+@given(asked())
+def test_a_suitable_goal_is_not_achieved_yet_and_the_expert_achieves_it(asked):
+    _, start, goal = asked
+    wanted, state = plan(start, goal), start
+    fits = wanted.verdict == 0
+    assert not (fits & achieved(start, start, goal)).any()
+    stopped = ~fits
+    for time in range(1, 41):
+        action = act(state, wanted)
+        stops = (action == STOP) & ~stopped
+        assert (wanted.steps[stops] == time).all()
+        stopped |= stops
+        state = step(state, torch.where(stopped, STOP, action))
+        # On the way there is no success but at the end.
+        assert torch.equal(achieved(start, state, goal) & fits, _there(start, state, goal) & fits)
+        if stopped.all():
+            break
+    assert achieved(start, state, goal)[fits].all()
+
+
+def _there(start, state, goal) -> torch.Tensor:
+    rows = zip(plain(start), plain(state), wishes(goal), strict=True)
+    return torch.tensor([holds(*row) for row in rows])
+
+
+@law
+@given(asked())
+def test_the_plan_shortens_by_one_with_each_step_of_the_expert(asked):
+    _, state, goal = asked
+    wanted = plan(state, goal)
+    fits = (wanted.verdict == 0) & ~wanted.carries
+    after = step(state, act(state, wanted))
+    assert (plan(after, goal).steps == wanted.steps - 1)[fits].all()
+
+
+@law
+@given(tasks, st.data())
+def test_every_paraphrase_has_one_goal_and_one_verdict(task, data):
+    known = grammar(task)
+    goals, wordings = len(known.sentences) // len(PHRASINGS[task]), len(PHRASINGS[task])
+    first = wordings * data.draw(st.integers(0, goals - 1))
+    said = list(known.sentences[first : first + wordings])
+    assert len(set(said)) == wordings
+    goal = known.parse(said)
+    assert (goal == goal[0]).all()
+    state = random_layout(1, generator=torch.Generator().manual_seed(first))
+    verdicts = verdict(torch.cat([state] * wordings), goal)
+    assert len(verdicts.unique()) == 1
+    assert N_TEMPLATES[task] in (wordings, 4 * wordings)
+
+
+@law
+@given(tasks, st.data())
+def test_sentences_survive_tokens_and_goals(task, data):
+    known = grammar(task)
+    row = data.draw(st.integers(0, len(known.sentences) - 1))
+    sentence = known.sentences[row]
+    (again,) = VOCABULARY.decode(VOCABULARY.encode(sentence))
+    assert again == sentence
+    wording = torch.tensor([row % len(PHRASINGS[task])])
+    assert VOCABULARY.decode(known.encode(known.parse(sentence), wording)) == [sentence]
+
+
+@settings(law, max_examples=8)
+@given(tasks, st.integers(0, 2**40), st.lists(st.integers(0, 3000), min_size=1, max_size=8))
+def test_scenes_are_a_function_of_seed_and_number(task, seed, numbers):
+    def stream() -> SceneStream:
+        return SceneStream(SceneOptions(task), seed)
+
+    together = stream().scenes(torch.tensor(numbers))
+    one, other = stream(), torch.tensor(numbers)
+    alone = torch.cat([one.scenes(number[None]) for number in other.flip(0)]).flip(0)
+    assert (together == alone).all()
+    assert (together.wanted.verdict == 0).all()

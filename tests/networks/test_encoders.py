@@ -1,0 +1,151 @@
+import pytest
+import torch
+from torch import nn
+from torch.nn.utils.rnn import pack_padded_sequence
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import ConvEncoder, InstructionEncoder, PatchEncoder, distinct_rows
+from ifo_grounding.networks import encoders as encoders_module
+
+
+def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) -> torch.Tensor:
+    source = torch.Generator().manual_seed(seed)
+    tokens = torch.randint(1, vocabulary, (rows, length), generator=source)
+    lengths = torch.randint(1, length + 1, (rows, 1), generator=source)
+    return tokens * (torch.arange(length) < lengths)
+
+
+@pytest.fixture
+def encoder():
+    torch.manual_seed(0)
+    return InstructionEncoder(40, embedding=8, hidden=16)
+
+
+def reference_gru(encoder: InstructionEncoder) -> nn.GRU:
+    gru = nn.GRU(8, 16, batch_first=True, bidirectional=True)
+    with torch.no_grad():
+        for way, suffix in enumerate(("l0", "l0_reverse")):
+            getattr(gru, f"weight_ih_{suffix}").copy_(encoder.input_weight[way].T)
+            getattr(gru, f"weight_hh_{suffix}").copy_(encoder.state_weight[way].T)
+            getattr(gru, f"bias_ih_{suffix}").copy_(encoder.input_bias[way, 0])
+            getattr(gru, f"bias_hh_{suffix}").copy_(encoder.state_bias[way, 0])
+    return gru
+
+
+def test_encoder_is_the_bidirectional_gru_of_pytorch_over_packed_sentences(encoder):
+    tokens = sentences(50)
+    packed = pack_padded_sequence(
+        encoder.embedding(tokens), (tokens != 0).sum(1), batch_first=True, enforce_sorted=False
+    )
+    _, state = reference_gru(encoder)(packed)
+    torch.testing.assert_close(encoder(tokens), torch.cat([state[0], state[1]], -1))
+
+
+def test_padding_changes_nothing_and_is_zero_alone(encoder):
+    tokens = torch.tensor([[3, 7, 2]])
+    longer = torch.tensor([[3, 7, 2, 0, 0, 0]])
+    torch.testing.assert_close(encoder(tokens), encoder(longer))
+    mixed = encoder(torch.cat([longer, torch.zeros(2, 6, dtype=torch.int64)]))
+    assert torch.equal(mixed[1:], torch.zeros(2, 32))
+    torch.testing.assert_close(mixed[:1], encoder(tokens))
+
+
+def test_word_order_matters(encoder):
+    first, second = encoder(torch.tensor([[3, 7, 2], [2, 7, 3]]))
+    assert not torch.allclose(first, second)
+
+
+def test_no_rows_give_no_features(encoder):
+    assert encoder(torch.zeros(0, 16, dtype=torch.int64)).shape == (0, 32)
+
+
+@pytest.mark.parametrize("bad", [-1, 40])
+def test_ids_outside_the_vocabulary_are_refused(encoder, bad):
+    with pytest.raises(UserError, match=r"knows 0 to 39"):
+        encoder(torch.tensor([[1, bad, 2]]))
+
+
+def test_each_distinct_instruction_is_encoded_once(encoder, monkeypatch):
+    rows = []
+    encode = InstructionEncoder._encode
+    monkeypatch.setattr(
+        InstructionEncoder,
+        "_encode",
+        lambda self, tokens: rows.append(len(tokens)) or encode(self, tokens),
+    )
+    pool = sentences(12)
+    tokens = pool[torch.randint(12, (200,))]
+    features = encoder(tokens)
+    assert rows == [len(torch.unique(tokens, dim=0))]
+    torch.testing.assert_close(features, encode(encoder, tokens))
+
+
+def test_gradients_are_those_of_encoding_every_row_and_repeat_exactly(encoder):
+    tokens = sentences(12)[torch.randint(12, (200,))]
+    target = torch.randn(200, 32)
+
+    def gradients(encode):
+        encoder.zero_grad()
+        (encode(tokens) * target).sum().backward()
+        return [parameter.grad.clone() for parameter in encoder.parameters()]
+
+    once = gradients(encoder)
+    for grad, every in zip(once, gradients(encoder._encode), strict=True):
+        torch.testing.assert_close(grad, every, rtol=1e-4, atol=1e-5)
+    assert all(map(torch.equal, once, gradients(encoder)))
+
+
+def test_encoder_works_under_vmap(encoder):
+    tokens = sentences(8).reshape(2, 4, 16)
+    torch.testing.assert_close(
+        torch.vmap(encoder)(tokens), encoder(tokens.flatten(0, 1)).reshape(2, 4, 32)
+    )
+
+
+def test_distinct_rows_survive_hash_collisions(monkeypatch):
+    tokens = sentences(100)[torch.randint(100, (300,))]
+    expected = torch.unique(tokens, dim=0)
+    rows, inverse = distinct_rows(tokens)
+    assert torch.equal(rows[inverse], tokens)
+    assert len(rows) == len(expected)
+    monkeypatch.setattr(encoders_module, "_hash", lambda tokens: tokens.sum(-1) % 3)
+    rows, inverse = distinct_rows(tokens)
+    assert torch.equal(rows[inverse], tokens)
+    assert torch.equal(rows, expected)
+
+
+def test_conv_encoder_is_the_papers():
+    encoder = ConvEncoder(3, 32, 4)
+    convolutions = [layer for layer in encoder.layers if isinstance(layer, nn.Conv2d)]
+    assert [(c.out_channels, c.kernel_size, c.stride, c.padding) for c in convolutions] == [
+        (32, (3, 3), (2, 2), (1, 1))
+    ] * 4
+    for height, width in ((48, 48), (96, 96), (33, 70)):
+        features = encoder(torch.zeros(1, 3, height, width))
+        assert tuple(features.shape[-2:]) == ConvEncoder.grid(height, width, 4)
+
+
+def test_patch_encoder_is_a_strided_convolution_plus_places():
+    torch.manual_seed(0)
+    encoder = PatchEncoder(3, 16, patch=8, grid=(5, 7))
+    pixels = torch.randint(256, (4, 3, 40, 56), dtype=torch.uint8)
+    kernel = encoder.embed.weight.reshape(16, 3, 8, 8)
+    convolved = nn.functional.conv2d(pixels / 255, kernel, encoder.embed.bias, stride=8)
+    torch.testing.assert_close(encoder(pixels), convolved + encoder.place.permute(2, 0, 1))
+
+
+def test_patches_of_a_ragged_image_are_padded_with_black():
+    encoder = PatchEncoder(3, 16, patch=8, grid=(2, 2))
+    ragged = torch.randint(256, (1, 3, 9, 15), dtype=torch.uint8)
+    padded = torch.zeros(1, 3, 16, 16, dtype=torch.uint8)
+    padded[..., :9, :15] = ragged
+    torch.testing.assert_close(encoder(ragged), encoder(padded))
+
+
+def test_one_patch_sees_one_cell():
+    encoder = PatchEncoder(3, 16, patch=8, grid=(6, 6))
+    pixels = torch.zeros(1, 3, 48, 48, dtype=torch.uint8)
+    changed = pixels.clone()
+    changed[..., 8:16, 24:32] = 255
+    different = (encoder(pixels) != encoder(changed)).any(1)[0]
+    assert different.nonzero().tolist() == [[1, 3]]

@@ -1,0 +1,156 @@
+"""What every network must do, whatever it is for."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import NetworkConfig, Shapes
+from networks.conftest import MAKERS, OUTPUTS, inputs
+
+SIZES = [
+    Shapes((3, 48, 48), 40, tile_size=8),
+    Shapes((3, 96, 96), 40, tile_size=16),
+    Shapes((1, 30, 21), 7, instruction_length=5, n_actions=3),
+    Shapes((3, 80, 80), 11, instruction_length=1, n_actions=9, tile_size=8),
+]
+
+
+def run(kind, module, data):
+    key, size = OUTPUTS[kind]
+    own = data.select(*module.in_keys)
+    return module(own)[key], size
+
+
+@pytest.mark.parametrize("sizes", SIZES, ids=str)
+def test_other_images_vocabularies_lengths_and_action_counts_work(kind, preset, sizes):
+    module = MAKERS[kind](sizes, preset, seed=0)
+    out, size = run(kind, module, inputs(sizes, [3]))
+    assert out.shape == (3, sizes.n_actions if size == "A" else size)
+    assert out.dtype == torch.float32
+    assert out.isfinite().all()
+
+
+@pytest.mark.parametrize("batch", [[], [1], [0], [4], [2, 3], [2, 1, 2]], ids=str)
+def test_any_leading_dims_give_what_one_dim_gives(kind, preset, shapes, batch):
+    module = MAKERS[kind](shapes, preset, seed=0)
+    data = inputs(shapes, batch)
+    out, _ = run(kind, module, data)
+    flat = data.reshape(data.batch_size.numel()) if batch else data.unsqueeze(0)
+    expected, _ = run(kind, module, flat)
+    assert out.shape[:-1] == tuple(batch)
+    torch.testing.assert_close(out.reshape(expected.shape), expected)
+
+
+def test_samples_do_not_see_each_other(kind, preset, shapes):
+    module = MAKERS[kind](shapes, preset, seed=0)
+    data = inputs(shapes, [6])
+    out, _ = run(kind, module, data)
+    order = torch.tensor([5, 0, 3, 1, 4, 2])
+    torch.testing.assert_close(run(kind, module, data[order])[0], out[order])
+
+
+def test_every_input_matters(kind, preset, shapes):
+    module = MAKERS[kind](shapes, preset, seed=0)
+    data = inputs(shapes, [4])
+    out, _ = run(kind, module, data)
+    other = inputs(shapes, [4], seed=1)
+    other["action"] = (data["action"] + 1) % 6
+    for key in module.in_keys:
+        changed = data.clone().set(key, other[key])
+        assert (run(kind, module, changed)[0] != out).any(-1).all(), key
+
+
+def test_the_seed_alone_decides_the_weights_and_the_global_generator_stays(kind, shapes):
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    first = MAKERS[kind](shapes, seed=3)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(2)
+    second, third = MAKERS[kind](shapes, seed=3), MAKERS[kind](shapes, seed=4)
+    assert all(map(torch.equal, first.parameters(), second.parameters()))
+    assert not all(map(torch.equal, first.parameters(), third.parameters()))
+
+
+def test_networks_come_in_eval_mode_and_repeat_themselves(kind, preset, shapes):
+    module = MAKERS[kind](shapes, preset, seed=0)
+    assert not any(part.training for part in module.modules())
+    data = inputs(shapes, [3])
+    assert torch.equal(run(kind, module, data)[0], run(kind, module, data)[0])
+
+
+def test_the_paper_has_dropout_but_no_critic_does(kind, shapes):
+    module = MAKERS[kind](shapes, "paper", seed=0).train()
+    data = inputs(shapes, [3])
+    repeats = torch.equal(run(kind, module, data)[0], run(kind, module, data)[0])
+    assert repeats == (kind == "value")
+
+
+def test_floats_in_zero_to_one_are_bytes_over_255(kind, preset, shapes):
+    module = MAKERS[kind](shapes, preset, seed=0)
+    data = inputs(shapes, [3])
+    floats = data.apply(lambda x: x / 255 if x.dtype == torch.uint8 else x)
+    torch.testing.assert_close(run(kind, module, data)[0], run(kind, module, floats)[0])
+
+
+def test_keys_can_be_nested(kind, shapes):
+    plain = MAKERS[kind](shapes, seed=0)
+    nested_in = [("agent", *([key] if isinstance(key, str) else key)) for key in plain.in_keys]
+    if kind == "policy":
+        keys = {"action_key": ("agent", "choice"), "logits_key": ("agent", "scores")}
+    else:
+        keys = {"out_key": ("agent", "judged")}
+    nested = MAKERS[kind](shapes, in_keys=nested_in, seed=0, **keys)
+    data = inputs(shapes, [3])
+    moved = TensorDict({"agent": data.clone()}, [3])
+    out = nested(moved.select(*nested_in))
+    expected, _ = run(kind, plain, data)
+    assert torch.equal(out[keys.get("out_key", ("agent", "scores"))], expected)
+    if kind == "policy":
+        assert out["agent", "choice"].dtype == torch.int64
+        assert out["agent", "choice_log_prob"].shape == (3,)
+
+
+def test_wrong_images_batches_and_options_are_named(kind, shapes):
+    module = MAKERS[kind](shapes, seed=0)
+    small = inputs(Shapes((3, 40, 48), 40), [2])
+    with pytest.raises(UserError, match=r"built for images of \(3, 48, 48\), got \(3, 40, 48\)"):
+        run(kind, module, small)
+    with pytest.raises(UserError, match="unknown preset 'weak': choose one of 'paper', 'strong'"):
+        MAKERS[kind](shapes, "weak")
+    with pytest.raises(UserError, match="unknown option of a network 'depth'"):
+        MAKERS[kind](shapes, depth=3)
+    with pytest.raises(UserError, match="in_keys must be"):
+        MAKERS[kind](shapes, in_keys=["pixels"])
+
+
+def test_inputs_of_different_batches_are_refused(shapes):
+    policy = MAKERS["policy"](shapes, seed=0).module[0].module
+    with pytest.raises(UserError, match=r"same batch dims, got pixels \[4\], instruction \[1\]"):
+        policy(torch.zeros(4, 3, 48, 48), torch.ones(1, 16))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("features", 0), ("dropout", 1.0), ("patch_size", 0), ("precision", "fp8"), ("hidden", -1)],
+)
+def test_impossible_configurations_are_refused(name, value):
+    with pytest.raises(UserError, match=name):
+        NetworkConfig.of("policy", **{name: value})
+
+
+def test_presets_are_what_the_design_says():
+    paper = NetworkConfig.of("policy", "paper")
+    assert (paper.conv_layers, paper.features, paper.hidden, paper.embedding) == (4, 32, 64, 8)
+    assert paper.dropout == 0.25
+    strong = NetworkConfig.of("policy", "strong")
+    assert (strong.n_blocks, strong.features) == (4, 64)
+
+
+def test_bf16_stays_near_fp32(kind, preset, shapes):
+    data = inputs(shapes, [4])
+    exact, _ = run(kind, MAKERS[kind](shapes, preset, seed=0, precision="fp32"), data)
+    rough, _ = run(kind, MAKERS[kind](shapes, preset, seed=0, precision="bf16"), data)
+    assert rough.dtype == torch.float32
+    assert not torch.equal(rough, exact)
+    torch.testing.assert_close(rough, exact, atol=0.03, rtol=0.05)

@@ -1,0 +1,109 @@
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import Shapes, make_policy
+from ifo_grounding.tasks.vocabulary import VOCABULARY
+
+
+def env(instruction, action, batch=(5,), **attributes):
+    pixels = Bounded(0, 255, (*batch, 3, 40, 56), dtype=torch.uint8)
+    return SimpleNamespace(
+        observation_spec=Composite(pixels=pixels, instruction=instruction, shape=batch),
+        full_action_spec=Composite(action=action, shape=batch),
+        **attributes,
+    )
+
+
+INSTRUCTIONS = {
+    "categorical": Categorical(23, shape=(5, 12)),
+    "bounded": Bounded(0, 22, (5, 12), dtype=torch.int64),
+    "multi": MultiCategorical([23] * 12, shape=(5, 12)),
+}
+
+
+@pytest.mark.parametrize("instruction", INSTRUCTIONS.values(), ids=INSTRUCTIONS)
+@pytest.mark.parametrize("action", [Categorical(4, shape=(5,)), OneHot(4, shape=(5, 4))])
+def test_sizes_are_read_from_specs(instruction, action):
+    assert Shapes.of(env(instruction, action)) == Shapes((3, 40, 56), 23, 12, 4)
+
+
+def test_attributes_win_over_specs():
+    source = env(INSTRUCTIONS["categorical"], Categorical(4, shape=(5,)))
+    source.vocabulary_size, source.tile_size, source.instruction_length = 30, 16, 9
+    assert Shapes.of(source) == Shapes((3, 40, 56), 30, 9, 4, tile_size=16)
+
+
+def test_an_env_without_instructions_says_its_vocabulary():
+    source = SimpleNamespace(
+        observation_spec=Composite(pixels=Unbounded((2, 3, 8, 8), dtype=torch.uint8), shape=(2,)),
+        vocabulary_size=30,
+    )
+    assert Shapes.of(source) == Shapes((3, 8, 8), 30)
+    del source.vocabulary_size
+    with pytest.raises(UserError, match=r"cannot read vocabulary_size.*'instruction'"):
+        Shapes.of(source)
+
+
+def test_an_unbounded_vocabulary_is_refused():
+    source = env(Unbounded((5, 12), dtype=torch.int64), Categorical(4, shape=(5,)))
+    with pytest.raises(UserError, match="cannot read vocabulary_size"):
+        Shapes.of(source)
+
+
+def test_a_dataset_is_read_by_its_attributes():
+    dataset = SimpleNamespace(image_shape=[3, 48, 48], vocabulary_size=40, tile_size=8)
+    assert Shapes.of(dataset) == Shapes((3, 48, 48), 40, tile_size=8)
+
+
+def test_nested_keys_are_found():
+    inner = env(INSTRUCTIONS["bounded"], Categorical(4, shape=(5,)))
+    source = SimpleNamespace(
+        observation_spec=Composite(agent=inner.observation_spec, shape=(5,)),
+        full_action_spec=Composite(agent=inner.full_action_spec, shape=(5,)),
+    )
+    names = {name: ("agent", name) for name in ("pixels", "instruction", "action")}
+    assert Shapes.of(source, **names) == Shapes((3, 40, 56), 23, 12, 4)
+
+
+@pytest.mark.parametrize("bad", [{"image_shape": (3, 8)}, {"vocabulary_size": 0}])
+def test_impossible_sizes_are_refused(bad):
+    with pytest.raises(UserError, match=next(iter(bad))):
+        Shapes(**{"image_shape": (3, 8, 8), "vocabulary_size": 3, **bad})
+
+
+def test_patches_are_tiles_unless_told_otherwise():
+    def patch(shapes, **options):
+        return make_policy(shapes, **options).network_config.config.patch_size
+
+    assert patch(Shapes((3, 96, 96), 9, tile_size=16)) == 16
+    assert patch(Shapes((3, 96, 96), 9)) == 8
+    assert patch(Shapes((3, 96, 96), 9, tile_size=16), patch_size=12) == 12
+
+
+@pytest.mark.parametrize("instructed", [True, False])
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
+def test_the_real_env_says_it_all(instructed, wrap):
+    env = PickAndPlaceEnv("move", num_envs=2, tile_size=16, instructed=instructed)
+    assert Shapes.of(wrap(env)) == Shapes((3, 96, 96), len(VOCABULARY), tile_size=16)
+
+
+def test_a_vector_of_envs_says_what_its_specs_say():
+    env = SerialEnv(2, lambda: PickAndPlaceEnv("move", num_envs=2))
+    assert Shapes.of(env).image_shape == (3, 48, 48)
+    assert Shapes.of(env).vocabulary_size == len(VOCABULARY)
+    bare = SerialEnv(2, lambda: PickAndPlaceEnv("move", num_envs=2, instructed=False))
+    with pytest.raises(UserError, match="cannot read vocabulary_size from SerialEnv"):
+        Shapes.of(bare)
+
+
+def test_a_policy_acts_in_the_real_env():
+    env = PickAndPlaceEnv("move", num_envs=3, seed=0)
+    out = env.rollout(4, make_policy(env, seed=0), break_when_any_done=False)
+    assert out.shape == (3, 4)
+    assert out["action_log_prob"].shape == (3, 4)

@@ -1,0 +1,191 @@
+"""What every loss must do, whatever it is for."""
+
+import re
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import LossModule
+
+from ifo_grounding.errors import UserError
+from objectives.conftest import POOL, batch, make_loss, total
+
+
+def modes(network):
+    return [part.training for part in network.modules()]
+
+
+def test_it_writes_what_it_says_and_only_losses_carry_gradients(kind, preset):
+    loss = make_loss(kind, preset)
+    assert isinstance(loss, LossModule)
+    out = loss(batch())
+    assert list(out.keys()) == loss.out_keys
+    for key, value in out.items():
+        assert value.shape == ()
+        assert value.requires_grad == key.startswith("loss_")
+
+
+def test_it_reads_what_it_says_and_leaves_its_input_alone(kind):
+    loss = make_loss(kind)
+    data = batch().select(*loss.in_keys)
+    before = data.clone()
+    loss(data)
+    assert set(data.keys(True, True)) == set(before.keys(True, True))
+    assert (data == before).all()
+    for key in loss.in_keys:
+        with pytest.raises(UserError, match=f"lacks .{re.escape(repr(key))}"):
+            loss(data.exclude(key))
+
+
+def test_it_can_be_called_without_a_tensordict(kind):
+    loss = make_loss(kind)
+    data = batch().select(*loss.in_keys)
+    named = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in loss.in_keys}
+    torch.manual_seed(0)
+    out = loss(data)
+    torch.manual_seed(0)
+    values = loss(**named)
+    assert all(map(torch.equal, (out[key] for key in loss.out_keys), values))
+
+
+@pytest.mark.parametrize("size", [(), (1,), (3, 4)], ids=str)
+def test_any_batch_dims_give_what_one_dim_gives(kind, size):
+    loss = make_loss(kind, make_options={"precision": "fp32"})
+    data = batch(size)
+    torch.manual_seed(0)
+    out = loss(data)
+    torch.manual_seed(0)
+    flat = loss(data.reshape(-1) if size else data.unsqueeze(0))
+    torch.testing.assert_close(out.to_dict(), flat.to_dict())
+
+
+def test_gradients_reach_every_parameter(kind, preset):
+    loss = make_loss(kind, preset)
+    total(loss(batch((64,)))).backward()
+    for name, parameter in loss.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_its_parameters_are_the_networks_own(kind):
+    loss = make_loss(kind)
+    assert {id(p) for p in loss.parameters()} == {id(p) for p in loss.network.parameters()}
+
+
+def test_state_round_trip(kind):
+    first = make_loss(kind)
+    second = make_loss(kind, make_options={"features": 64})
+    with torch.no_grad():
+        for parameter in first.parameters():
+            parameter.add_(torch.randn_like(parameter) * 0.01)
+    if kind == "inverse":
+        second = make_loss(kind)
+    second.load_state_dict(first.state_dict())
+    for loss in (first, second):
+        loss.eval()
+    data = batch()
+    torch.manual_seed(0)
+    expected = first(data)
+    torch.manual_seed(0)
+    torch.testing.assert_close(second(data).to_dict(), expected.to_dict(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("network_training", [True, False])
+@pytest.mark.parametrize("loss_training", [True, False])
+def test_the_network_computes_in_the_mode_of_the_loss_and_keeps_its_own(
+    kind, loss_training, network_training
+):
+    loss = make_loss(kind, "paper").train(loss_training)
+    loss.network.train(network_training)
+    before = modes(loss.network)
+    seen = []
+    hook = next(part for part in loss.network.modules() if isinstance(part, torch.nn.Dropout))
+    hook.register_forward_hook(lambda part, *_: seen.append(part.training))
+    loss(batch())
+    assert set(seen) == {loss_training}
+    assert modes(loss.network) == before
+
+
+def test_the_mode_comes_back_after_an_error(kind):
+    loss = make_loss(kind)
+    with pytest.raises((UserError, KeyError, RuntimeError)):
+        loss(batch().set("pixels", torch.zeros(12, 3, 8, 8)))
+    assert not any(modes(loss.network))
+
+
+def test_a_loss_in_eval_mode_repeats_itself(kind):
+    loss = make_loss(kind, "paper").eval()
+    data = batch()
+    results = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        results.append(loss(data).to_dict())
+    torch.testing.assert_close(*results, rtol=0, atol=0)
+
+
+def test_keys_of_networks_and_losses_can_be_nested(kind):
+    plain = make_loss(kind)
+    names = plain.network.in_keys
+    nested = [("agent", *([key] if isinstance(key, str) else key)) for key in names]
+    loss = make_loss(kind, make_options={"in_keys": nested})
+    own = {"action": ("agent", "action"), "final": ("agent", "final")}
+    loss.set_keys(**{name: key for name, key in own.items() if hasattr(loss.tensor_keys, name)})
+    data = batch()
+    torch.manual_seed(0)
+    expected = plain(data)
+    torch.manual_seed(0)
+    out = loss(TensorDict({"agent": data}, [12]))
+    torch.testing.assert_close(out.to_dict(), expected.to_dict())
+    assert all(key[0] == "agent" for key in loss.in_keys)
+    with pytest.raises(ValueError, match="not an accepted tensordict key"):
+        loss.set_keys(nonsense="a")
+
+
+@pytest.mark.parametrize("kind", ["inverse", "imitation", "reward"])
+def test_reductions(kind):
+    data = batch((3, 4))
+    results = {}
+    for reduction in ("mean", "sum", "none"):
+        torch.manual_seed(0)
+        results[reduction] = total(make_loss(kind, reduction=reduction)(data))
+    assert results["none"].shape == (3, 4)
+    torch.testing.assert_close(results["none"].mean(), results["mean"])
+    torch.testing.assert_close(results["none"].sum(), results["sum"])
+    with pytest.raises(UserError, match="unknown reduction"):
+        make_loss(kind, reduction="median")
+
+
+@pytest.mark.parametrize("kind", ["inverse", "imitation", "reward"])
+def test_padding_that_torchrl_marks_does_not_count(kind):
+    loss = make_loss(kind).eval()
+    data = batch((3, 4))
+    mask = torch.zeros(3, 4, dtype=torch.bool)
+    mask[:, :2] = True
+    torch.manual_seed(0)
+    masked = loss(data.clone().set(("collector", "mask"), mask))
+    torch.manual_seed(0)
+    spoiled = data.clone().set(("collector", "mask"), mask)
+    spoiled["pixels"][:, 2:] = 0
+    torch.testing.assert_close(loss(spoiled).to_dict(), masked.to_dict())
+    assert not torch.equal(total(loss(data)), total(masked))
+
+
+def test_it_learns_a_small_batch_by_heart(kind):
+    torch.manual_seed(0)
+    loss = make_loss(kind, make_options={"features": 32, "n_blocks": 1})
+    data = batch((12,))
+    data["instruction"] = POOL
+    if hasattr(loss, "set_progress"):
+        loss.set_progress(0.0)
+    first = float(total(loss(data)).detach())
+    optimizer = torch.optim.Adam(loss.parameters(), 3e-3)
+    for _ in range(400):
+        optimizer.zero_grad()
+        out = loss(data)
+        total(out).backward()
+        optimizer.step()
+        if float(total(out).detach()) < 0.03 * first:
+            break
+    checked = loss.eval()(data)
+    assert float(total(checked).detach()) < 0.15 * first
+    assert float(checked.get("accuracy", torch.ones(()))) == 1

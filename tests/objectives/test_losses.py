@@ -1,0 +1,236 @@
+"""Values worked out by hand, from networks that answer what they are told."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torch.distributions import Categorical
+from torchrl.modules import OneHotCategorical, ProbabilisticActor
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.objectives import (
+    GoalLoss,
+    ImitationLoss,
+    InstructionLoss,
+    InverseLoss,
+    RewardLoss,
+)
+from objectives.conftest import POOL, batch, make_loss
+
+LOGITS = torch.log(torch.tensor([[0.5, 0.25, 0.25], [0.1, 0.1, 0.8]]))
+
+
+def logit(probability: float) -> float:
+    return math.log(probability / (1 - probability))
+
+
+class Answer(nn.Module):
+    """Says what it was built with, whatever it is asked."""
+
+    def __init__(self, answer: torch.Tensor) -> None:
+        super().__init__()
+        self.answer = nn.Parameter(answer)
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        return self.answer
+
+
+def actor(logits, distribution=Categorical):
+    return ProbabilisticActor(
+        TensorDictModule(Answer(logits), in_keys=["pixels"], out_keys=["logits"]),
+        in_keys=["logits"],
+        distribution_class=distribution,
+        return_log_prob=True,
+    )
+
+
+def labelled(actions) -> TensorDict:
+    return TensorDict({"pixels": torch.zeros(2, 1), "action": torch.tensor(actions)}, [2])
+
+
+def test_inverse_loss_by_hand():
+    network = TensorDictModule(Answer(LOGITS), in_keys=["pixels"], out_keys=["guess"])
+    out = InverseLoss(network)(labelled([1, 2]))
+    assert out["loss_inverse"].item() == pytest.approx(-(math.log(0.25) + math.log(0.8)) / 2)
+    assert float(out["accuracy"]) == 0.5
+
+
+def test_imitation_loss_by_hand():
+    out = ImitationLoss(actor(LOGITS))(labelled([1, 2]))
+    assert out["loss_imitation"].item() == pytest.approx(-(math.log(0.25) + math.log(0.8)) / 2)
+    assert float(out["accuracy"]) == 0.5
+    first = 0.5 * math.log(2) + 0.5 * math.log(4)
+    second = 0.2 * math.log(10) + 0.8 * math.log(1.25)
+    assert float(out["entropy"]) == pytest.approx((first + second) / 2)
+
+
+def test_one_hot_and_categorical_are_never_confused():
+    one_hot = torch.tensor([[0, 1, 0], [0, 0, 1]])
+    hot = actor(LOGITS, OneHotCategorical)
+    out = ImitationLoss(hot)(labelled([1, 2]).set("action", one_hot))
+    assert out["loss_imitation"].item() == pytest.approx(-(math.log(0.25) + math.log(0.8)) / 2)
+    assert float(out["accuracy"]) == 0.5
+    for loss in (ImitationLoss(actor(LOGITS)), InverseLoss(actor(LOGITS).module[0])):
+        for wrong in (one_hot, torch.tensor([[1], [2]])):
+            with pytest.raises(UserError, match="actions must have shape"):
+                loss(labelled([1, 2]).set("action", wrong))
+    with pytest.raises(UserError, match="actions must have shape"):
+        ImitationLoss(hot)(labelled([1, 2]))
+
+
+class Suitability(nn.Module):
+    """The logit of an instruction is a table's entry for its first word."""
+
+    def __init__(self, table: torch.Tensor) -> None:
+        super().__init__()
+        self.table = nn.Parameter(table)
+
+    def forward(self, pixels: torch.Tensor, instruction: torch.Tensor) -> torch.Tensor:
+        return self.table[instruction[..., :1]]
+
+
+def suitability(probabilities) -> TensorDictModule:
+    table = torch.tensor([0.0, *map(logit, probabilities)])
+    return TensorDictModule(
+        Suitability(table), in_keys=["pixels", "instruction"], out_keys=["suitability"]
+    )
+
+
+def test_instruction_loss_by_hand():
+    pool = torch.tensor([[1, 0], [2, 0]])
+    data = TensorDict({"pixels": torch.zeros(2, 1), "instruction": pool}, [2])
+    loss = InstructionLoss(suitability([0.9, 0.6]), pool, negatives=4, removal_rate=0.0)
+    out = loss(data)
+    # each scene's only negative is the other's instruction
+    positives = -(math.log(0.9) + math.log(0.6)) / 2
+    negatives = -(math.log(0.1) + math.log(0.4)) / 2
+    assert out["loss_instruction"].item() == pytest.approx((positives + negatives) / 2, rel=1e-5)
+    assert float(out["positive_probability"]) == pytest.approx(0.75)
+    assert float(out["negative_probability"]) == pytest.approx(0.75)
+    assert float(out["removed"]) == 0
+
+
+def test_the_likeliest_negatives_are_removed_after_the_warm_up():
+    pool = torch.tensor([[1, 0], [2, 0]])
+    data = TensorDict({"pixels": torch.zeros(2, 1), "instruction": pool}, [2])
+    loss = InstructionLoss(suitability([0.9, 0.6]), pool, negatives=4, removal_rate=0.5)
+    loss.set_progress(0.3)
+    assert float(loss(data)["removed"]) == 0
+    loss.set_progress(1 / 3)
+    out = loss(data)
+    # the half that scores 0.9 goes: what is left is 0.6 against scene 1
+    positives = -(math.log(0.9) + math.log(0.6)) / 2
+    expected = (positives - math.log(0.4)) / 2
+    assert float(out["removed"]) == 0.5
+    assert out["loss_instruction"].item() == pytest.approx(expected, rel=1e-5)
+    out["loss_instruction"].backward()
+    grad = loss.network.module.table.grad
+    # 0.9 is pulled up as a positive alone; 0.6 up as a positive and down as a negative
+    assert float(grad[1]) == pytest.approx(-(1 - 0.9) / 4, rel=1e-4)
+    assert float(grad[2]) == pytest.approx(-(1 - 0.6) / 4 + 0.6 / 2, rel=1e-4)
+
+
+def test_halves_and_whole_networks_give_the_same_loss():
+    loss = make_loss("instruction", "strong", removal_rate=0.3)
+    whole = TensorDictModule(
+        loss.network.module.forward, in_keys=["pixels", "instruction"], out_keys=["suitability"]
+    )
+    data = batch()
+    torch.manual_seed(0)
+    expected = loss(data)
+    torch.manual_seed(0)
+    other = InstructionLoss(whole, POOL, removal_rate=0.3)
+    torch.testing.assert_close(other(data).to_dict(), expected.to_dict())
+
+
+def test_images_are_encoded_once_whatever_the_number_of_negatives():
+    loss = make_loss("instruction", negatives=11)
+    rows = []
+    loss.network.module.image.register_forward_hook(lambda _, args, out: rows.append(len(out)))
+    loss(batch((7,)))
+    assert rows == [7]
+
+
+@pytest.mark.parametrize("given", ["all_actions", "whole"])
+def test_reward_loss_by_hand(given):
+    right, wrong = 0.8, 0.3
+    scores = torch.tensor([[logit(right), logit(wrong)], [logit(wrong), logit(right)]])
+
+    class Judge(nn.Module):
+        def forward(self, pixels, action):
+            return scores.gather(-1, action.unsqueeze(-1))
+
+    judge = Judge()
+    if given == "all_actions":
+        judge.all_actions = lambda pixels: scores
+    network = TensorDictModule(judge, in_keys=["pixels", "action"], out_keys=["score"])
+    out = RewardLoss(network, n_actions=2)(labelled([0, 1]))
+    expected = -(math.log(0.8) + math.log(0.7)) / 2
+    assert out["loss_reward"].item() == pytest.approx(expected, rel=1e-5)
+    assert float(out["positive_probability"]) == pytest.approx(right)
+    assert float(out["negative_probability"]) == pytest.approx(wrong)
+
+
+def test_adversarial_reward_loss_by_hand():
+    table = torch.tensor([[logit(0.8), logit(0.3)]]).expand(2, -1)
+
+    class Judge(nn.Module):
+        def all_actions(self, pixels):
+            return table[: len(pixels)]
+
+    network = TensorDictModule(Judge(), in_keys=["pixels", "action"], out_keys=["score"])
+    demonstrations = labelled([0, 1])
+    policy = TensorDict({"pixels": torch.zeros(1, 1), "action": torch.tensor([0])}, [1])
+    out = RewardLoss(network, n_actions=2).adversarial(demonstrations, policy, smoothing=0.1)
+    positives = -(0.9 * math.log(0.8) + 0.1 * math.log(0.2) + 0.9 * math.log(0.3)) / 2
+    positives -= 0.1 * math.log(0.7) / 2
+    negatives = -(0.1 * math.log(0.8) + 0.9 * math.log(0.2))
+    assert out["loss_reward"].item() == pytest.approx((positives + negatives) / 2, rel=1e-5)
+    assert float(out["positive_probability"]) == pytest.approx(0.55)
+    assert float(out["negative_probability"]) == pytest.approx(0.8)
+
+
+def test_adversarial_training_pushes_the_policys_actions_down():
+    loss = make_loss("reward")
+    data = batch((16,))
+    policy = data.clone().set("action", (data["action"] + 1) % 6)
+    optimizer = torch.optim.Adam(loss.parameters(), 1e-3)
+    for _ in range(60):
+        optimizer.zero_grad()
+        out = loss.adversarial(data, policy)
+        out["loss_reward"].backward()
+        optimizer.step()
+    assert float(out["positive_probability"]) > 0.75
+    assert float(out["negative_probability"]) < 0.25
+    assert not any(part.training for part in loss.network.modules())
+
+
+def test_goal_loss_by_hand():
+    pool = torch.tensor([[1, 0], [2, 0]])
+    data = TensorDict(
+        {
+            "pixels": torch.zeros(3, 1),
+            "instruction": pool[[0, 0, 1]],
+            "final": torch.tensor([[True], [False], [False]]),
+        },
+        [3],
+    )
+    out = GoalLoss(suitability([0.9, 0.6]), pool, removal_rate=0.0)(data)
+    finished, elsewhere = -math.log(0.9), -math.log(0.4)
+    unfinished = -(math.log(0.1) + math.log(0.4)) / 2
+    expected = (finished + (unfinished + elsewhere) / 2) / 2
+    assert out["loss_goal"].item() == pytest.approx(expected, rel=1e-5)
+    assert float(out["final_probability"]) == pytest.approx(0.9)
+    assert float(out["unfinished_probability"]) == pytest.approx(0.75)
+    assert float(out["negative_probability"]) == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("final", [True, False])
+def test_a_batch_without_one_class_still_has_a_finite_loss(final):
+    loss = make_loss("goal")
+    out = loss(batch().set("final", torch.full((12, 1), final)))
+    assert out["loss_goal"].isfinite()
+    out["loss_goal"].backward()

@@ -1,0 +1,55 @@
+import pytest
+import torch
+
+from ifo_grounding.objectives.mixture import MixtureEstimate, best_bin_estimate
+from ifo_grounding.objectives.pairs import MOST_REMOVED, NegativeInstructions
+
+POOL = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.36, 0.7])
+def test_the_share_is_found_from_overlapping_scores(share):
+    draw = torch.Generator().manual_seed(0)
+    positive = torch.randn(4000, generator=draw) + 3
+    hidden = int(4000 * share)
+    others = torch.randn(4000 - hidden, generator=draw)
+    unlabelled = torch.cat([torch.randn(hidden, generator=draw) + 3, others])
+    assert best_bin_estimate(positive, unlabelled) == pytest.approx(share, abs=0.04)
+
+
+def test_scores_without_information_say_that_all_may_be_positive():
+    draw = torch.Generator().manual_seed(0)
+    same = torch.randn(2, 4000, generator=draw)
+    assert best_bin_estimate(*same) > 0.9
+
+
+def test_the_oldest_scores_are_forgotten():
+    estimate = MixtureEstimate(size=10)
+    estimate.add(torch.ones(8), torch.ones(8))
+    assert estimate.share() == 1.0
+    estimate.add(torch.ones(10), -torch.ones(10))
+    assert estimate.share() == 0.0
+    assert int(estimate.count) == 18
+
+
+def test_scores_travel_with_the_state():
+    estimate, other = MixtureEstimate(size=10), MixtureEstimate(size=10)
+    estimate.add(torch.ones(4), torch.tensor([1.0, -1.0, -1.0, -1.0]))
+    other.load_state_dict(estimate.state_dict())
+    assert other.share() == estimate.share() == 0.25
+
+
+def test_the_estimated_share_is_removed_after_the_warm_up():
+    negatives = NegativeInstructions(POOL, "estimated", warmup=0.5)
+    scores = torch.tensor([3.0, -1.0, -2.0, -3.0])
+    negatives.watch(torch.full((4,), 3.0), scores)
+    negatives.progress = 0.4
+    assert negatives.keep(scores).all()
+    negatives.progress = 0.6
+    assert negatives.keep(scores).tolist() == [False, True, True, True]
+
+
+def test_an_untrained_classifier_does_not_remove_nearly_all():
+    negatives = NegativeInstructions(POOL, "estimated")
+    negatives.watch(torch.zeros(100), torch.zeros(100))
+    assert negatives.removal_rate == MOST_REMOVED

@@ -1,0 +1,81 @@
+import pytest
+import torch
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.objectives import InstructionLoss, NegativeInstructions, RewardLoss
+from objectives.conftest import LOSSES, POOL, SHAPES
+
+
+def chi_squared(counts: torch.Tensor) -> float:
+    expected = counts.float().mean()
+    return float(((counts - expected) ** 2 / expected).sum())
+
+
+def test_negatives_are_uniform_among_all_others():
+    negatives = NegativeInstructions(POOL, 0.0, generator=torch.Generator().manual_seed(0))
+    own = POOL[4].expand(1000, -1)
+    drawn = negatives.draw(own, 20)
+    assert drawn.shape == (1000, 20, 4)
+    counts = torch.bincount(drawn[..., 0].flatten(), minlength=13)[1:]
+    assert counts[4] == 0
+    others = counts[counts > 0]
+    assert len(others) == 11
+    assert chi_squared(others) < 35.6  # 10 degrees of freedom, p = 1e-4
+
+
+def test_negatives_of_an_instruction_outside_the_pool_are_uniform_among_all():
+    negatives = NegativeInstructions(POOL, 0.0, generator=torch.Generator().manual_seed(0))
+    drawn = negatives.draw(torch.full((1000, 4), 13), 20)
+    counts = torch.bincount(drawn[..., 0].flatten(), minlength=13)[1:]
+    assert chi_squared(counts) < 37.4  # 11 degrees of freedom, p = 1e-4
+
+
+def test_repeated_rows_of_a_pool_are_never_drawn_against_themselves():
+    pool = POOL[[0, 0, 0, 1]]
+    negatives = NegativeInstructions(pool, 0.0)
+    assert negatives.draw(pool, 50)[:3, :, 0].unique().tolist() == [2]
+
+
+def test_a_generator_repeats_the_draws():
+    def draws():
+        source = torch.Generator().manual_seed(5)
+        return NegativeInstructions(POOL, 0.0, generator=source).draw(POOL, 3)
+
+    assert torch.equal(draws(), draws())
+
+
+@pytest.mark.parametrize(("rate", "count", "dropped"), [(0.0, 10, 0), (0.3, 10, 3), (0.3, 3, 0)])
+def test_the_top_share_is_dropped(rate, count, dropped):
+    scores = torch.randn(count)
+    kept = NegativeInstructions(POOL, rate).keep(scores)
+    assert int((~kept).sum()) == dropped
+    if dropped:
+        assert scores[~kept].min() > scores[kept].max()
+
+
+def test_nothing_scored_nothing_dropped():
+    assert NegativeInstructions(POOL, 0.3).keep(torch.zeros(0)).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("pool", "options", "message"),
+    [
+        (POOL[[3, 3]], {}, "fewer than two different"),
+        (POOL[0], {}, "token ids"),
+        (POOL.float(), {}, "token ids"),
+        (POOL, {"removal_rate": 1.0}, "removal_rate"),
+        (POOL, {"negatives": 0}, "negatives"),
+    ],
+)
+def test_impossible_negatives_are_refused(pool, options, message):
+    make, _, _ = LOSSES["instruction"]
+    with pytest.raises(UserError, match=message):
+        InstructionLoss(make(SHAPES), pool, **options)
+
+
+def test_random_actions_are_uniform_among_the_others():
+    make, _, _ = LOSSES["reward"]
+    loss = RewardLoss(make(SHAPES), generator=torch.Generator().manual_seed(0))
+    counts = torch.bincount(loss._different(torch.full((10_000,), 4)), minlength=6)
+    assert counts[4] == 0
+    assert chi_squared(counts[counts > 0]) < 23.6  # 4 degrees of freedom, p = 1e-4

@@ -1,0 +1,69 @@
+"""A recipe killed at any moment continues to the same result."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from ifo_grounding._recipes import recipes_folder
+from ifo_grounding.files import read_json
+
+STAGES = ["collect_transitions", "train_inverse", "record_demonstrations", "label"]
+OPTIONS = ["budget=tiny", "progress=false", "threads=1", "checkpoint_seconds=0"]
+
+
+def start(name, run, *extra):
+    command = [sys.executable, str(recipes_folder() / f"{name}.py"), f"run={run}", *OPTIONS, *extra]
+    return subprocess.Popen(
+        command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL
+    )
+
+
+def finish(name, run, *extra):
+    assert start(name, run, *extra).wait() == 0
+
+
+@pytest.fixture
+def prepared(tmp_path):
+    for name in STAGES:
+        finish(name, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_sigkill_changes_nothing(prepared, tmp_path):
+    import shutil
+
+    steps = ["imitate.steps=60", "imitate.iteration=2", "imitate.batch_size=64"]
+    whole = tmp_path / "whole"
+    shutil.copytree(prepared, whole)
+    finish("imitate", whole, *steps)
+    draw = random.Random(0)
+    checkpoint = prepared / "checkpoints" / "imitate.pt"
+    killed = 0
+    for _ in range(3):
+        process = start("imitate", prepared, *steps)
+        deadline = time.monotonic() + 120
+        before = checkpoint.stat().st_mtime_ns if checkpoint.exists() else None
+        while process.poll() is None and time.monotonic() < deadline:
+            if checkpoint.exists() and checkpoint.stat().st_mtime_ns != before:
+                time.sleep(draw.uniform(0, 0.3))
+                break
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        killed += process.wait() == -signal.SIGKILL
+    assert killed
+    finish("imitate", prepared, *steps)
+    name = "policy-phase1.safetensors"
+    weights, expected = load_file(prepared / name), load_file(whole / name)
+    assert weights.keys() == expected.keys()
+    assert all(torch.equal(weight, expected[key]) for key, weight in weights.items())
+    results = [read_json(run / "stages" / "imitate.json")["result"] for run in (prepared, whole)]
+    for result in results:
+        result.pop("samples_per_second")
+    assert results[0] == results[1]

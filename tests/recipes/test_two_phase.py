@@ -1,0 +1,85 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from ifo_grounding import networks
+from ifo_grounding.errors import UserError
+from ifo_grounding.report import results_table
+
+PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "extra"),
+    [
+        ("move", "strong", []),
+        ("pick-udlr", "paper", ["self_examine.pairs=24"]),
+        ("pick-out", "strong", ["self_examine.kind=both", "self_examine.reward_steps=1"]),
+    ],
+)
+def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, preset, extra):
+    from two_phase import two_phase
+
+    from report import report
+
+    options = compose("two_phase", f"task={task}", f"preset={preset}", *extra)
+    results = two_phase(options)
+    run = tmp_path / "run"
+
+    assert {path.name for path in run.glob("policy*")} == PHASES
+    assert results["phase1"]["scenes"] == results["phase2"]["scenes"]
+    assert results["phase1"]["rate"]["count"] == 50
+    assert results["gain"]["count"] == 50
+    assert 0 < results["labels"]["rate"]["rate"] <= 1
+    table = results_table(results)
+    assert "phase 2 - phase 1" in table
+    assert "suitable rate" in table
+
+    page = report(options)
+    text = page.read_text()
+    assert "Self-examination" in text
+    assert "http" not in text.replace("http://www.w3.org", "")
+    audit = json.loads((run / "metrics" / "self_examine.json").read_text())
+    assert [row["step"] for row in audit] == [1, 2]
+    assert all("success" in row for row in audit)
+
+    # A second call finds everything done.
+    stamps = {path: path.stat().st_mtime_ns for path in run.rglob("*.safetensors")}
+    assert two_phase(options) == results
+    assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
+
+
+def test_a_changed_option_redoes_what_depends_on_it(compose, tmp_path):
+    from imitate import imitate
+    from label import label
+    from record_demonstrations import record
+    from train_inverse import train_inverse
+    from collect_transitions import collect  # isort: skip
+
+    options = compose("imitate")
+    for stage in (collect, train_inverse, record, label, imitate):
+        stage(options)
+    first = networks.load(tmp_path / "run" / "policy-phase1.safetensors").state_dict()
+    inverse = (tmp_path / "run" / "inverse.safetensors").stat().st_mtime_ns
+    changed = compose("imitate", "imitate.steps=25")
+    for stage in (collect, train_inverse, record, label, imitate):
+        stage(changed)
+    second = networks.load(tmp_path / "run" / "policy-phase1.safetensors").state_dict()
+    assert (tmp_path / "run" / "inverse.safetensors").stat().st_mtime_ns == inverse
+    assert any(not torch.equal(weight, second[name]) for name, weight in first.items())
+
+
+def test_a_stage_without_what_it_needs_says_what_to_run(compose):
+    from imitate import imitate
+
+    with pytest.raises(UserError, match="run the recipe record_demonstrations"):
+        imitate(compose("imitate"))
+
+
+def test_every_recipe_has_options_that_begin_with_its_command(recipes):
+    for script in recipes.glob("[!_]*.py"):
+        first = (recipes / "conf" / f"{script.stem}.yaml").read_text().splitlines()[0]
+        assert first.startswith(f"# python recipes/{script.name}"), script.name
+        assert Path(script).read_text().startswith('"""')

@@ -1,0 +1,141 @@
+"""Animations and galleries show the frames that they were given."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tensordict.nn import TensorDictModule
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import Episode, success_rate, suitable_rate
+from ifo_grounding.report import (
+    Case,
+    animation,
+    changed_scenes,
+    gallery,
+    improved_episodes,
+    instruction_cases,
+    save_animation,
+)
+from ifo_grounding.report.drawing import BAD, BORDER, GOOD, PADDING, RUNNING, wrapped
+from ifo_grounding.tasks import grammar
+
+
+def episode(colours, success, stopped=True):
+    """One frame per colour."""
+    frames = np.stack([np.full((3, 48, 48), 0, np.uint8) for _ in colours])
+    for frame, colour in zip(frames, colours, strict=True):
+        frame[:] = np.array(colour, np.uint8)[:, None, None]
+    actions = np.full(len(colours) - 1, 5)
+    return Episode(frames, actions, "move to the red circle", success, stopped, 0)
+
+
+def frames_of(gif):
+    """Decode all frames."""
+    image = Image.open(io.BytesIO(gif))
+    result, durations = [], []
+    for number in range(image.n_frames):
+        image.seek(number)
+        durations.append(image.info["duration"])
+        result.append(np.asarray(image.convert("RGB")).astype(int))
+    return result, durations
+
+
+def near(pixel, colour):
+    """Whether a pixel has a colour, up to the palette."""
+    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return np.abs(pixel - wanted).max() < 12
+
+
+def test_frames_outcomes_and_waiting():
+    short = episode([(255, 0, 0), (0, 0, 255)], success=True)
+    long = episode([(0, 255, 0)] * 3 + [(255, 255, 0)], success=False)
+    frames, durations = frames_of(animation([short, long], fps=5, hold=3, width=100))
+    assert durations == [200, 200, 200, 3000]
+    middle = (PADDING + BORDER + 40, PADDING + BORDER + 40)
+    cell = 2 * 48 + 2 * BORDER + PADDING + (100 - 96)
+    for step, frame in enumerate(frames):
+        assert near(frame[middle], "#FF0000" if step == 0 else "#0000FF")
+        assert near(frame[middle[0], middle[1] + cell], "#FFFF00" if step == 3 else "#00FF00")
+        edge = frame[PADDING + 1, PADDING + 1]
+        assert near(edge, RUNNING if step == 0 else GOOD)
+        assert near(frame[PADDING + 1, PADDING + 1 + cell], BAD if step == 3 else RUNNING)
+
+
+def test_columns_make_rows():
+    clips = [episode([(9, 9, 9)] * 2, True)] * 5
+    wide = Image.open(io.BytesIO(animation(clips, columns=5))).size
+    tall = Image.open(io.BytesIO(animation(clips, columns=2))).size
+    assert tall[0] < wide[0] / 2 and tall[1] > 2.5 * wide[1]
+
+
+def test_captions_are_wrapped_not_cut():
+    text = "pick up the yellow triangle and place it to the right of the blue circle"
+    lines = wrapped(text, 200)
+    assert len(lines) > 1 and " ".join(lines) == text
+
+
+def test_animation_refusals(tmp_path):
+    with pytest.raises(UserError, match="at least one episode"):
+        animation([])
+    with pytest.raises(UserError, match="one per episode"):
+        animation([episode([(0, 0, 0)] * 2, True)], titles=["a", "b"])
+    with pytest.raises(UserError, match=r"uint8 \[3, H, W\]"):
+        animation([Episode(np.zeros((2, 48, 48, 3)), np.array([5]), "a", True, True, 0)])
+    path = save_animation(tmp_path / "a.gif", [episode([(0, 0, 0)] * 2, True)])
+    assert path.read_bytes()[:6] == b"GIF89a"
+
+
+def test_gallery_marks_the_unsuitable():
+    picture = np.zeros((3, 48, 48), np.uint8)
+    cases = [Case(picture, "move", True, "suitable"), Case(picture, "move", False, "missing")]
+    sheet = np.asarray(Image.open(io.BytesIO(gallery(cases, width=96)))).astype(int)
+    assert near(sheet[PADDING + 1, PADDING + 1], GOOD)
+    assert near(sheet[PADDING + 1, 2 * PADDING + 2 * BORDER + 96 + 1], BAD)
+    with pytest.raises(UserError, match="at least one case"):
+        gallery([])
+
+
+def test_cases_agree_with_the_suitable_rate():
+    def score(pixels, instruction):
+        return torch.full((len(pixels), 1), 3.0)
+
+    yes = TensorDictModule(score, ["pixels", "instruction"], ["suitability"])
+    pool = grammar("move").tokens
+    rate = suitable_rate(yes, "move", pool, states=200, pairs_per_state=0)
+    cases = instruction_cases(yes, "move", pool, count=200, unsuitable=200, search=200)
+    assert sum(case.good for case in cases) == rate.rate.successes
+    assert len(cases) == 200
+    notes = {case.note for case in cases}
+    assert "suitable (0.95)" in notes and "missing (0.95)" in notes
+    assert all(case.good == case.note.startswith("suitable") for case in cases)
+    assert cases[0].picture.shape == (3, 192, 192)
+    few = instruction_cases(yes, "move", pool, count=12, search=200)
+    assert [case.good for case in few] == [True] * 8 + [False] * 4
+    none = instruction_cases(yes, "move", pool, threshold=0.99)
+    assert none == []
+
+
+def test_scenes_that_only_the_second_policy_solves():
+    def stop(td):
+        return td.set("action", torch.full(td.shape, 5))
+
+    def up(td):
+        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
+
+    before = success_rate(stop, "move", episodes=150)
+    after = success_rate(up, "move", episodes=150)
+    scenes = changed_scenes(before, after)
+    assert scenes == after.outcomes.nonzero().squeeze(-1).tolist()
+    assert changed_scenes(before, after, improved=False) == []
+    episodes, titles = improved_episodes(stop, up, "move", scenes[:2])
+    assert titles == ["phase 1", "phase 1", "phase 2", "phase 2"]
+    assert [e.success for e in episodes] == [False, False, True, True]
+    assert [e.scene for e in episodes] == scenes[:2] * 2
+    other = success_rate(stop, "move", episodes=150, seed=1)
+    with pytest.raises(UserError, match="different scenes"):
+        changed_scenes(before, other)

@@ -1,0 +1,132 @@
+"""The page holds everything, escapes everything, and needs nothing."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.report import Case, success_over_iterations, write_report
+from ifo_grounding.stats import paired_difference, wilson
+
+VOID = {"meta", "img", "source", "br", "link", "input", "hr"}
+
+
+class Outline(HTMLParser):
+    """Collects texts, attributes, and unbalanced tags."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.texts, self.sources, self.headings = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        """Remember what is open and what is embedded."""
+        if tag not in VOID:
+            self.open.append(tag)
+        self.sources += [value for key, value in attrs if key in ("src", "srcset", "href")]
+
+    def handle_endtag(self, tag):
+        """Close the innermost tag, which has to be this one."""
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        """Collect visible text."""
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+        if data.strip() and "style" not in self.open:
+            self.texts.append(data.strip())
+
+
+def read(page):
+    """Parse a page and check that its tags match."""
+    outline = Outline()
+    outline.feed(page.read_text())
+    assert outline.open == []
+    return outline
+
+
+@pytest.fixture
+def page(tmp_path):
+    """Write a page with every kind of content."""
+    picture = np.zeros((3, 48, 48), np.uint8)
+    figure = success_over_iterations([0, 1], [wilson(1, 9), wilson(5, 9)])
+    gif = tmp_path / "clip.gif"
+    gif.write_bytes(base64.b64decode("R0lGODlhAQABAIAAAAAAAP///ywAAAAAAQABAAACAUwAOw=="))
+    results = {
+        "Phase 1": wilson(1900, 2000),
+        "Difference": paired_difference([0, 1], [1, 1]),
+        "By task": [{"task": "move", "success": wilson(9, 10)}, {"task": "<b>", "success": None}],
+        "Settings": {"seed": 0, "rate": 8e-4, "path": torch.tensor([1, 2]), "nan": float("nan")},
+        "Remark": "5 < 6 & so on",
+    }
+    pictures = {
+        "Curve": figure,
+        "Cases": [Case(picture, "move <here>", False, "missing")],
+        "No cases": [],
+        "Clip": gif,
+        "Frame": picture,
+    }
+    return write_report(
+        tmp_path / "report", results, pictures, title="A & B", summary="s", notes={"Clip": "<i>"}
+    )
+
+
+def test_it_is_one_page_without_any_outside_source(page):
+    outline = read(page)
+    assert outline.sources
+    for source in outline.sources:
+        assert re.match(r"data:image/(png|gif);base64,[A-Za-z0-9+/=]+$", source)
+    text = page.read_text()
+    assert not re.search(r"https?://|<script|@import|url\(", text)
+
+
+def test_every_content_is_there_and_escaped(page):
+    outline = read(page)
+    assert outline.headings == [
+        "By task",
+        "Settings",
+        "Remark",
+        "Curve",
+        "Cases",
+        "No cases",
+        "Clip",
+        "Frame",
+    ]
+    texts = outline.texts
+    for text in ("A & B", "95.0%", "[94.0, 95.9] (n=2000)", "+50.0 points", "5 < 6 & so on"):
+        assert text in texts, text
+    for text in ("<b>", "<i>", "move <here>", "missing", "None.", "0.0008", "–"):
+        assert text in texts, text
+
+
+def test_phones_and_dark_mode_are_served(page):
+    text = page.read_text()
+    assert 'name="viewport" content="width=device-width, initial-scale=1"' in text
+    assert "@media (prefers-color-scheme: dark)" in text
+    assert text.count('media="(prefers-color-scheme: dark)"') == 1  # the figure's dark version
+    assert "overflow-x: auto" in text
+
+
+def test_files_beside_the_page(page):
+    folder = page.parent
+    results = json.loads((folder / "results.json").read_text())
+    assert results["Phase 1"]["successes"] == 1900
+    assert results["By task"][0]["success"]["count"] == 10
+    assert results["Settings"] == {"seed": 0, "rate": 8e-4, "path": [1, 2], "nan": None}
+    names = sorted(path.name for path in (folder / "pictures").iterdir())
+    assert names == ["cases.png", "clip.gif", "curve.png", "frame.png"]
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(UserError, match="cannot read the picture"):
+        write_report(tmp_path, {}, {"Clip": tmp_path / "none.gif"})
+    with pytest.raises(UserError, match="PNG, GIF or JPEG"):
+        write_report(tmp_path, {}, {"Clip": b"text"})
+    with pytest.raises(UserError, match="no headings"):
+        write_report(tmp_path, {}, notes={"Other": "note"})

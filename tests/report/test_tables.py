@@ -1,0 +1,53 @@
+"""Tables letter by letter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.report import format_cell, markdown_table, text_table
+from ifo_grounding.stats import wilson
+
+ROWS = [
+    {"task": "move", "success": wilson(1946, 2000), "steps": 12_000},
+    {"task": "pick|out", "success": None, "steps": 7, "extra": 0.5},
+]
+
+
+def test_text_table():
+    assert text_table(ROWS, title="Results") == "\n".join(
+        [
+            "Results",
+            "task                          success   steps  extra",
+            "--------  ---------------------------  ------  -----",
+            "move      97.3% [96.5, 97.9] (n=2000)  12,000      –",
+            "pick|out                            –       7    0.5",
+        ]
+    )
+
+
+def test_markdown_table():
+    assert markdown_table(ROWS, ["task", "success"]) == "\n".join(
+        [
+            "| task | success |",
+            "| --- | ---: |",
+            "| move | 97.3% [96.5, 97.9] (n=2000) |",
+            r"| pick\|out | – |",
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (math.nan, "–"), (True, "yes"), (0.000123456, "0.000123"), ("as is", "as is")],
+)
+def test_cells(value, text):
+    assert format_cell(value) == text
+
+
+@pytest.mark.parametrize("make", [text_table, markdown_table])
+def test_empty_tables_are_refused(make):
+    with pytest.raises(UserError, match="at least one row"):
+        make([])

@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import STREAMS
+from ifo_grounding.tasks import (
+    HOLDOUTS,
+    TASKS,
+    VOCABULARY,
+    Scene,
+    SceneOptions,
+    SceneStream,
+    grammar,
+    suitable,
+)
+from ifo_grounding.tasks import scenes as module
+from ifo_grounding.tasks.grammar import holdout_kinds
+from ifo_grounding.tasks.scenes import CHUNK
+from ifo_grounding.world import COLOURS, SHAPES, Layout, render
+from reference import holds, judge, plain, wishes
+
+
+def first(n: int, seed: int = 0, **options) -> Scene:
+    return SceneStream(SceneOptions(**options), seed).scenes(torch.arange(n))
+
+
+def same(one: Scene, other: Scene) -> bool:
+    return bool((one == other).all())
+
+
+def looks(scenes: Scene) -> set[bytes]:
+    return {picture.tobytes() for picture in render(scenes.state).numpy()}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_instruction_is_suitable(task):
+    scenes = first(2500, task=task)
+    goals = grammar(task).parse_tokens(scenes.instruction)
+    assert suitable(scenes.state, goals).all()
+    rows = list(zip(plain(scenes.state[:400]), wishes(goals[:400]), strict=True))
+    assert {judge(world, wish) for world, wish in rows} == {"suitable"}
+    assert not any(holds(world, world, wish) for world, wish in rows)
+
+
+def test_a_number_names_one_scene_in_any_order():
+    options = SceneOptions("pick-out")
+    numbers = torch.tensor([3, 2 * CHUNK + 5, 0, CHUNK, 3, CHUNK - 1])
+    scenes = SceneStream(options, seed=0).scenes(numbers)
+    fresh = SceneStream(options, seed=0)
+    alone = torch.cat([fresh.scenes(number[None]) for number in numbers.flip(0)]).flip(0)
+    assert same(scenes, alone)
+    assert same(scenes[0], scenes[4])
+    assert not same(scenes[0], scenes[2])
+
+
+def test_the_same_seed_gives_the_same_scenes_and_another_seed_others():
+    assert same(first(100, task="pick"), first(100, task="pick"))
+    assert not looks(first(1000, task="pick")) & looks(first(1000, seed=1, task="pick"))
+
+
+def test_streams_are_disjoint():
+    assert STREAMS == ("training", "validation", "evaluation")
+    seen: set[bytes] = set()
+    for stream in STREAMS:
+        now = looks(first(3000, task="pick", stream=stream))
+        assert len(now) == 3000
+        assert not now & seen
+        seen |= now
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_instructed_scenes_are_the_others_conditioned_by_rejection_only(task):
+    """Where their goal suits, the free scenes of the first block are the first instructed ones."""
+    free = first(CHUNK, task=task, instructed=False)
+    kept = free[free.wanted.verdict == 0]
+    assert 100 < len(kept) < CHUNK
+    instructed = first(len(kept), task=task)
+    assert same(kept.state, instructed.state)
+
+
+def test_scenes_without_instructions_do_not_depend_on_the_split():
+    one, other = (first(200, instructed=False, task="move", split=s) for s in ("all", "zero-shot"))
+    assert (one.state == other.state).all()
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("holdout", ["pairs-1", "pairs-3"])
+def test_splits_mention_what_they_should(task, holdout):
+    options = {"task": task, "holdout": holdout}
+    train = VOCABULARY.decode(first(1500, split="train", **options).instruction)
+    novel = VOCABULARY.decode(first(600, split="zero-shot", **options).instruction)
+    assert not any(pair in sentence for sentence in train for pair in HOLDOUTS[holdout])
+    assert all(any(pair in sentence for pair in HOLDOUTS[holdout]) for sentence in novel)
+    assert {*COLOURS, *SHAPES} <= {word for sentence in train for word in sentence.split()}
+
+
+def test_held_out_pairs_are_seen_in_training_scenes_unless_hidden():
+    pairs = torch.tensor(holdout_kinds("pairs-3"), dtype=torch.uint8)
+    shown = first(1000, task="pick", split="train")
+    hidden = first(1000, task="pick", split="train", holdout_visible=False)
+    assert all((shown.state.objects == pair).any() for pair in pairs)
+    assert not torch.isin(hidden.state.objects, pairs).any()
+    novel = first(200, task="pick", split="zero-shot", holdout_visible=False)
+    assert torch.isin(novel.state.objects, pairs).any(-1).all()
+
+
+def test_wordings_are_equally_likely():
+    sentences = VOCABULARY.decode(first(4000, task="pick").instruction)
+    verbs = [sum(f" {verb} " in f" {s} " for s in sentences) for verb in ("put", "place", "drop")]
+    assert sum(verbs) == 4000
+    assert all(abs(count - 4000 / 3) < 5 * (4000 * 2 / 9) ** 0.5 for count in verbs)
+    assert abs(sum(s.startswith("pick up") for s in sentences) - 2000) < 5 * 1000**0.5
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("size", [3, 4, 10])
+def test_other_grids_have_scenes(task, size):
+    layout = Layout(size=size, objects=(2, 4), boxes=(2, 3))
+    scenes = first(50, task=task, layout=layout)
+    assert scenes.state.size == size
+    assert (scenes.wanted.verdict == 0).all()
+
+
+def test_no_goal_needs_more_steps_than_an_episode_has():
+    assert first(500, task="pick", max_steps=9).wanted.steps.max() <= 9
+
+
+def test_no_numbers_give_no_scenes():
+    stream = SceneStream(SceneOptions("move"), seed=0)
+    assert len(stream.scenes(torch.zeros(0, dtype=torch.int64))) == 0
+
+
+def test_bad_requests_are_refused(monkeypatch):
+    with pytest.raises(UserError, match="unknown task 'fly'"):
+        SceneOptions("fly")
+    with pytest.raises(UserError, match="unknown split 'x'"):
+        SceneOptions(split="x")
+    with pytest.raises(UserError, match="unknown stream 'x'"):
+        SceneOptions(stream="x")
+    with pytest.raises(UserError, match="unknown holdout 'x'"):
+        SceneOptions(holdout="x")
+    with pytest.raises(UserError, match="max_steps must be positive"):
+        SceneOptions(max_steps=0)
+    with pytest.raises(UserError, match="start at 0"):
+        SceneStream(SceneOptions(), 0).scenes(torch.tensor([-1]))
+    monkeypatch.setattr(module, "PATIENCE", 3)
+    with pytest.raises(UserError, match="only 0 scenes admit a suitable goal of 'pick'"):
+        SceneStream(SceneOptions("pick", layout=Layout(boxes=(0, 0))), 0).scenes(torch.tensor([0]))

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks import VOCABULARY, Vocabulary
+
+
+def test_sentences_and_tokens_by_hand():
+    vocabulary = Vocabulary(["go", "left", "now"], length=4)
+    tokens = vocabulary.encode(["go left", "now now now now"])
+    assert tokens.tolist() == [[1, 2, 0, 0], [3, 3, 3, 3]]
+    assert tokens.dtype == torch.int64
+    assert vocabulary.decode(tokens) == ["go left", "now now now now"]
+    assert vocabulary.decode(tokens[0]) == ["go left"]
+    assert vocabulary.encode("NOW go").tolist() == [[3, 1, 0, 0]]
+    assert len(vocabulary) == 4
+
+
+def test_the_default_has_room_for_every_instruction():
+    assert VOCABULARY.length == 16
+    assert len(VOCABULARY) == len(VOCABULARY.words) + 1
+
+
+def test_words_can_be_collected():
+    vocabulary = Vocabulary.from_sentences(["b a", "A c"], length=3)
+    assert vocabulary.words == ("a", "b", "c")
+    assert vocabulary == Vocabulary(["a", "b", "c"], 3)
+    assert hash(vocabulary) == hash(Vocabulary(["a", "b", "c"], 3))
+    assert vocabulary != Vocabulary(["a", "b", "c"], 4)
+    assert vocabulary != "a b c"
+
+
+@pytest.mark.parametrize(
+    ("sentence", "said"),
+    [
+        ("go right", "unknown word 'right' in 'go right': the vocabulary holds go, left"),
+        ("", "0 words"),
+        ("go go go", "3 words: an instruction has 1 to 2"),
+    ],
+)
+def test_bad_sentences_are_refused(sentence, said):
+    with pytest.raises(UserError, match=said):
+        Vocabulary(["go", "left"], length=2).encode([sentence])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(["a", "a"], "twice"), (["A"], "lower case"), (["a "], "spaces"), ([""], "lower case")],
+)
+def test_bad_vocabularies_are_refused(words, said):
+    with pytest.raises(UserError, match=said):
+        Vocabulary(words)

@@ -1,0 +1,152 @@
+"""The documentation does what it says: its Python runs, its commands and options exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.envs import Compose, TransformedEnv
+
+from ifo_grounding import objectives
+from ifo_grounding._recipes import check_options, recipe_names, recipes_folder
+from ifo_grounding.cli import resolve
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.networks import (
+    make_instruction_classifier,
+    make_policy,
+    make_reward_model,
+    make_value,
+)
+from ifo_grounding.tasks import grammar
+from ifo_grounding.training import SelfExaminationConfig, self_examine
+from ifo_grounding.training.self_examination import ALGORITHMS
+from ifo_grounding.transforms import InstructionSampler, LearnedReward
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NOT_EXECUTED = "<!-- not executed -->\n"
+
+
+def blocks(page: Path, *languages: str) -> list[tuple[int, str]]:
+    """Line number and code of each fenced block of some languages, in order."""
+    text = page.read_text()
+    return [
+        (text[: found.start(2)].count("\n") + 1, found[2])
+        for found in FENCE.finditer(text)
+        if found[1] in languages and not text[: found.start()].endswith(NOT_EXECUTED)
+    ]
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=name_of)
+def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
+    """All blocks of a page run one after the other, in a folder of their own, as a reader would."""
+    monkeypatch.chdir(tmp_path)
+    torch.manual_seed(0)
+    namespace: dict[str, object] = {"__name__": "__main__"}
+    for line, code in blocks(page, "python"):
+        # Leading newlines make a traceback point at the line of the page.
+        exec(compile("\n" * (line - 1) + code, str(page), "exec"), namespace)
+
+
+def commands(*starts: str) -> list[tuple[str, list[str]]]:
+    """Every shell command of the pages that begins with one of the given words."""
+    found = []
+    for page in PAGES:
+        for _, code in blocks(page, "bash", "sh"):
+            for line in code.replace("\\\n", " ").splitlines():
+                words = shlex.split(line, comments=True)
+                while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
+                    words.pop(0)
+                if words and words[0] in starts:
+                    found.append((name_of(page), words))
+    return found
+
+
+def test_every_recipe_command_has_options_that_exist():
+    checked = 0
+    for page, (_, command, *rest) in commands("ifo-grounding"):
+        if command.startswith("-"):
+            continue
+        recipe, options = resolve(command, rest)
+        check_options(recipes_folder() / "conf", recipe, options)
+        checked += 1
+        assert recipe in recipe_names(), page
+    assert checked >= 5
+
+
+def test_every_make_command_is_a_target():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    named = {words[1] for _, words in commands("make")}
+    assert named <= targets
+    assert {"demo", "test"} <= named
+
+
+def test_every_local_link_and_picture_exists():
+    missing = []
+    for page in PAGES:
+        text = FENCE.sub("", page.read_text())
+        for target in re.findall(r"\]\(([^)\s#]+)(?:#[^)]*)?\)|src=\"([^\"]+)\"", text):
+            path = "".join(target)
+            if "://" not in path and not (page.parent / path).exists():
+                missing.append(f"{name_of(page)}: {path}")
+    assert not missing
+
+
+def test_every_page_is_in_the_navigation():
+    listed = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    assert listed == {p.relative_to(ROOT / "docs").as_posix() for p in PAGES[1:]}
+
+
+def test_every_part_has_an_api_page():
+    package = ROOT / "src" / "ifo_grounding"
+    parts = {path.parent.name for path in package.glob("*/__init__.py")}
+    parts |= {path.stem for path in package.glob("[!_]*.py")}
+    text = "\n".join(path.read_text() for path in (ROOT / "docs" / "api").glob("*.md"))
+    documented = {name.split(".")[1] for name in re.findall(r"^::: ([\w.]+)$", text, re.MULTILINE)}
+    assert documented == parts
+
+
+def documented(*pages: str) -> set[str]:
+    """Everything that the pages set as code."""
+    text = "".join((ROOT / "docs" / f"{page}.md").read_text() for page in pages)
+    return set(re.findall(r"`([^`\n]+)`", text))
+
+
+def test_every_metric_of_a_loss_is_documented():
+    found = [getattr(objectives, name) for name in objectives.__all__]
+    losses = [one for one in found if one in objectives.SupervisedLoss.__subclasses__()]
+    # tensordict keeps the list under another name once a loss has been built.
+    keys = {key for loss in losses for key in vars(loss).get("_out_keys", loss.out_keys)}
+    assert len(losses) == 5
+    assert keys <= documented("phase1", "phase2")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_metric_of_self_examination_is_documented(algorithm):
+    base = PickAndPlaceEnv("move", num_envs=4, seed=0, instructed=False)
+    classifier = make_instruction_classifier(base, seed=0)
+    reward, policy = make_reward_model(base, seed=0), make_policy(base, seed=0)
+    pool = grammar("move").tokens
+    transforms = Compose(InstructionSampler(classifier, pool, threshold=0.0), LearnedReward(reward))
+    config = SelfExaminationConfig(algorithm, iterations=1, steps=4, minibatch=8, value_warmup=0)
+    env = TransformedEnv(base, transforms)
+    value = make_value(base, seed=0)
+    (metrics,) = self_examine(env, policy, value, config, seed=0)
+    assert set(metrics) <= documented("phase2")
+
+
+def test_blocks_run_in_one_namespace_and_marked_ones_do_not_run(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "text\n```python\nx = 1\n```\n"
+        f"{NOT_EXECUTED}```python\nboom\n```\n```bash\nls\n```\n```python\ny = x\n```\n"
+    )
+    assert blocks(page, "python") == [(3, "x = 1\n"), (13, "y = x\n")]

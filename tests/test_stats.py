@@ -1,0 +1,226 @@
+"""Intervals against numbers worked out by hand or by another method."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy import stats as scipy_stats
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.stats import (
+    Rate,
+    auc,
+    correlation,
+    holm,
+    paired_difference,
+    two_level_bootstrap,
+    wilson,
+)
+
+
+def test_wilson_by_hand():
+    # 8 of 10, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half 1.96 / 1.38415 * sqrt(0.025604).
+    rate = wilson(8, 10)
+    assert rate.rate == 0.8
+    assert rate.low == pytest.approx(0.4901625, abs=1e-6)
+    assert rate.high == pytest.approx(0.9433178, abs=1e-6)
+
+
+@pytest.mark.parametrize(("successes", "count"), [(0, 20), (1, 20), (20, 20), (1946, 2000)])
+@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
+def test_wilson_agrees_with_scipy(successes, count, confidence):
+    ours = wilson(successes, count, confidence)
+    theirs = scipy_stats.binomtest(successes, count).proportion_ci(confidence, method="wilson")
+    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), abs=1e-12)
+
+
+def test_wilson_of_nothing_says_so_and_stays_valid_json():
+    rate = wilson(0, 0)
+    assert math.isnan(rate.rate) and (rate.low, rate.high) == (0.0, 1.0)
+    assert str(rate) == "undefined (n=0)"
+    assert json.loads(json.dumps(rate.as_dict(), allow_nan=False))["rate"] is None
+
+
+@pytest.mark.parametrize(("successes", "count"), [(-1, 3), (4, 3)])
+def test_wilson_refuses_impossible_counts(successes, count):
+    with pytest.raises(UserError, match=r"successes must be 0\.\.count"):
+        wilson(successes, count)
+
+
+def test_confidence_must_be_a_share():
+    with pytest.raises(UserError, match="confidence"):
+        wilson(1, 2, confidence=95)
+
+
+def test_rate_reads_as_a_person_writes_it():
+    assert str(wilson(1946, 2000)) == "97.3% [96.5, 97.9] (n=2000)"
+    # A rare failure is not rounded away.
+    assert str(wilson(9999, 10_000)) == "99.99% [99.94, 100.00] (n=10000)"
+    assert str(wilson(99_999, 100_000)).startswith("99.999% [")
+    assert str(wilson(10, 10)).startswith("100.0% [")
+    assert Rate(0.5, 0.4, 0.6, 5, 10).as_dict() == {
+        "rate": 0.5,
+        "low": 0.4,
+        "high": 0.6,
+        "successes": 5,
+        "count": 10,
+        "method": "wilson",
+    }
+
+
+def test_bootstrap_of_one_seed_is_close_to_the_normal_interval():
+    outcomes = np.zeros(1000, bool)
+    outcomes[:300] = True
+    rate = two_level_bootstrap(outcomes, resamples=20_000)
+    half = 1.96 * math.sqrt(0.3 * 0.7 / 1000)  # 0.0284
+    assert rate.rate == 0.3
+    assert rate.low == pytest.approx(0.3 - half, abs=0.002)
+    assert rate.high == pytest.approx(0.3 + half, abs=0.002)
+
+
+def test_bootstrap_counts_the_spread_of_seeds():
+    # One seed fails always, one succeeds always: resampled means are 0, 1/2, 1 with 1/4, 1/2, 1/4.
+    outcomes = np.stack([np.zeros(500), np.ones(500)])
+    rate = two_level_bootstrap(outcomes)
+    assert (rate.rate, rate.low, rate.high) == (0.5, 0.0, 1.0)
+    assert (rate.successes, rate.count) == (500, 1000)
+
+
+def test_shared_scenes_widen_the_interval():
+    # Ten seeds that agree on every scene carry no more than one seed does.
+    scenes = np.arange(400) % 2 == 0
+    outcomes = np.repeat(scenes[None], 10, axis=0)
+    shared = two_level_bootstrap(outcomes)
+    separate = two_level_bootstrap(outcomes, shared_scenes=False)
+    half = 1.96 * math.sqrt(0.25 / 400)  # 0.049
+    assert shared.high - 0.5 == pytest.approx(half, abs=0.005)
+    assert separate.high - 0.5 == pytest.approx(half / math.sqrt(10), abs=0.003)
+
+
+def test_bootstrap_never_gives_an_empty_interval():
+    rate = two_level_bootstrap(np.ones((3, 100)))
+    assert rate.low == wilson(300, 300).low < 1.0
+
+
+def test_bootstrap_is_a_function_of_its_seed():
+    outcomes = np.random.default_rng(1).random((4, 50)) < 0.6
+    assert two_level_bootstrap(outcomes, seed=3) == two_level_bootstrap(outcomes, seed=3)
+    assert two_level_bootstrap(outcomes, seed=3) != two_level_bootstrap(outcomes, seed=4)
+
+
+def test_bootstrap_covers_the_truth_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for trial in range(200):
+        skill = rng.beta(8, 8, size=(12, 1))
+        rate = two_level_bootstrap(rng.random((12, 40)) < skill, resamples=300, seed=trial)
+        covered += rate.low <= 0.5 <= rate.high
+    assert covered >= 174  # 95% would be 190; a binomial with 0.9 falls below 174 in 6 of 1,000
+
+
+@pytest.mark.parametrize("bad", [[], [[[1]]], [0.5, 1.0]])
+def test_bootstrap_refuses_what_is_not_a_table_of_outcomes(bad):
+    with pytest.raises(UserError, match="outcomes must be"):
+        two_level_bootstrap(bad)
+
+
+def test_paired_difference_by_hand():
+    before = np.array([1] * 80 + [0] * 20)
+    after = np.array([1] * 78 + [0] * 2 + [1] * 12 + [0] * 8)
+    difference = paired_difference(before, after, resamples=20_000)
+    assert difference.points == pytest.approx(10.0)
+    assert (difference.better, difference.worse, difference.count) == (12, 2, 100)
+    # Variance of one scene's change: 14/100 - 0.1^2 = 0.13; half 1.96 * sqrt(0.13 / 100) = 7.07.
+    assert difference.low == pytest.approx(10 - 7.07, abs=1.0)
+    assert difference.high == pytest.approx(10 + 7.07, abs=1.0)
+    # McNemar: 2 * (C(14,0) + C(14,1) + C(14,2)) / 2^14 = 2 * 106 / 16384.
+    assert difference.p_value == pytest.approx(212 / 16384)
+
+
+def test_paired_difference_of_equal_policies_is_not_surer_than_it_can_be():
+    difference = paired_difference(np.ones(100), np.ones(100))
+    assert difference.points == 0.0 and difference.p_value == 1.0
+    # None of 100 changed: 1 - 0.025^(1/100) = 3.62 points either way.
+    assert difference.high == pytest.approx(3.6217, abs=1e-3)
+    assert difference.low == -difference.high
+
+
+def test_paired_difference_over_seeds_needs_agreement_of_seeds():
+    before = np.zeros((2, 200))
+    after = np.stack([np.ones(200), np.zeros(200)])  # one seed gains all, the other nothing
+    difference = paired_difference(before, after)
+    assert (difference.points, difference.low, difference.high) == (50.0, 0.0, 100.0)
+    assert difference.p_value > 0.05
+    sure = paired_difference(before, np.ones((2, 200)))
+    assert sure.p_value < 0.001
+
+
+def test_paired_difference_refuses_other_scenes():
+    with pytest.raises(UserError, match="same scenes"):
+        paired_difference(np.ones(3), np.ones(4))
+
+
+def test_holm_by_hand():
+    # Sorted 0.005, 0.01, 0.03, 0.04 times 4, 3, 2, 1: 0.02, 0.03, 0.06, 0.04 -> running maximum.
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_holm_refuses_what_is_not_a_probability():
+    with pytest.raises(UserError, match="p_values"):
+        holm([0.1, 1.2])
+
+
+def test_auc_counts_pairs():
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 6, 40), rng.integers(0, 5, 30)
+    pairs = (x[:, None] > y).mean() + 0.5 * (x[:, None] == y).mean()
+    assert auc(x, y).value == pytest.approx(pairs)
+    assert auc([3, 4], [1, 2]).value == 1.0
+    assert math.isnan(auc([], [1.0]).value)
+
+
+def test_auc_interval_matches_its_spread_over_samples():
+    rng = np.random.default_rng(0)
+    samples = [auc(rng.normal(1, 1, 100), rng.normal(0, 1, 300)) for _ in range(300)]
+    spread = np.std([s.value for s in samples])
+    width = np.mean([s.high - s.low for s in samples])
+    assert width == pytest.approx(2 * 1.96 * spread, rel=0.15)
+
+
+def test_auc_of_groups_knows_that_copies_add_nothing():
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(1, 1, 50), rng.normal(0, 1, 50)
+    once = auc(x, y)
+    group = np.repeat(np.arange(50), 4)
+    copied = auc(
+        np.repeat(x, 4), np.repeat(y, 4), positive_groups=group, negative_groups=group + 50
+    )
+    naive = auc(np.repeat(x, 4), np.repeat(y, 4))
+    assert copied.value == pytest.approx(once.value)
+    assert copied.high - copied.low == pytest.approx(once.high - once.low, rel=0.02)
+    assert naive.high - naive.low < 0.6 * (once.high - once.low)
+
+
+def test_auc_refuses_broken_scores():
+    with pytest.raises(UserError, match="finite"):
+        auc([1.0, math.nan], [0.0])
+
+
+def test_correlation_against_scipy():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=60)
+    y = x + rng.normal(size=60)
+    ours, theirs = correlation(x, y), scipy_stats.pearsonr(x, y)
+    interval = theirs.confidence_interval()
+    assert ours.value == pytest.approx(theirs.statistic)
+    assert (ours.low, ours.high) == pytest.approx((interval.low, interval.high))
+
+
+def test_correlation_is_undefined_without_variation():
+    assert math.isnan(correlation([1, 1, 1, 1], [0, 1, 0, 1]).value)
+    assert correlation([1, 1, 1, 1], [0, 1, 0, 1]).as_dict()["value"] is None

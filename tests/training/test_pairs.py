@@ -1,0 +1,103 @@
+"""select_pairs: scenes and instructions that were chosen, stored, and read again."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.training import load_pairs, save_pairs, select_pairs
+from ifo_grounding.transforms import NothingSuitableError, frame_hash
+from transforms.counter_world import POOL, CounterWorld, classifier
+
+
+def test_pairs_are_distinct_scenes_with_suitable_instructions():
+    world = CounterWorld((8,), seed=3)
+    pairs = select_pairs(world, classifier(), POOL, 50)
+    assert pairs.shape == (50,)
+    assert {key: (value.shape[1:], value.dtype) for key, value in pairs.items()} == {
+        "scene": ((1,), torch.int64),
+        "instruction": ((4,), torch.int64),
+        "score": ((1,), torch.float32),
+        "frame_hash": ((1,), torch.int64),
+    }
+    assert pairs["scene"].unique().numel() == 50
+    number = (pairs["scene"] * 7 + 3) % 10
+    assert (pairs["instruction"][:, :1] - 1 > number).all()
+    assert (number != 9).all()
+    assert torch.allclose(pairs["score"], torch.tensor(3.0).sigmoid())
+
+
+def test_pairs_hold_the_scene_that_the_simulator_draws_again():
+    world = PickAndPlaceEnv("pick-out", num_envs=16, seed=7, instructed=False)
+    sure = TensorDictModule(
+        lambda pixels, instruction: 2.0 * (pixels.flatten(1).sum(1, keepdim=True) // 64 % 2) - 0.5,
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+    pairs = select_pairs(world, sure, torch.ones(2, 16).long(), 40)
+    assert torch.cat([pairs["scene"][1:] - pairs["scene"][:-1]]).max() > 1  # some were passed over
+    fresh = PickAndPlaceEnv("pick-out", num_envs=40, seed=7, instructed=False)
+    pixels = fresh.reset(pairs.select("scene"))["pixels"]
+    assert torch.equal(frame_hash(pixels), pairs["frame_hash"][:, 0])
+
+
+def test_same_seed_same_pairs():
+    def pairs(seed):
+        return select_pairs(CounterWorld((8,)), classifier(), POOL, 30, seed=seed)
+
+    assert (pairs(1) == pairs(1)).all()
+    assert not (pairs(1)["instruction"] == pairs(2)["instruction"]).all()
+
+
+def test_round_trip(tmp_path):
+    pairs = select_pairs(CounterWorld((8,)), classifier(), POOL, 12)
+    save_pairs(pairs, tmp_path / "pairs.safetensors")
+    again = load_pairs(tmp_path / "pairs.safetensors")
+    assert again.shape == (12,) and set(again.keys()) == set(pairs.keys())
+    assert (again == pairs).all()
+    assert [path.name for path in tmp_path.iterdir()] == ["pairs.safetensors"]
+
+
+def test_damaged_files_are_refused(tmp_path):
+    path = tmp_path / "pairs.safetensors"
+    with pytest.raises(UserError, match="does not exist: make it with select_pairs"):
+        load_pairs(path)
+    save_pairs(select_pairs(CounterWorld((8,)), classifier(), POOL, 12), path)
+    whole = path.read_bytes()
+    for damaged in (whole[:-10], whole[: len(whole) // 3], b"", b"hello"):
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match="holds no pairs"):
+            load_pairs(path)
+    from safetensors.torch import save_file
+
+    save_file({"scene": torch.ones(2, 1)}, path)
+    with pytest.raises(UserError, match=r"pairs lack \['instruction'\]"):
+        load_pairs(path)
+    save_file({"scene": torch.ones(2, 1), "instruction": torch.ones(3, 4).long()}, path)
+    with pytest.raises(UserError, match="different lengths"):
+        load_pairs(path)
+
+
+def test_nothing_suitable_is_one_clear_line():
+    with pytest.raises(NothingSuitableError, match=r"any of the last 400 states \(best score"):
+        select_pairs(CounterWorld((4,)), classifier(), POOL, 5, threshold=0.99)
+
+
+def test_environments_that_do_not_suit_are_refused():
+    with pytest.raises(UserError, match="use instructed=False"):
+        select_pairs(CounterWorld((4,), instructed=True), classifier(), POOL, 5)
+    with pytest.raises(UserError, match="at least 1"):
+        select_pairs(CounterWorld((4,)), classifier(), POOL, 0)
+    nameless = CounterWorld((4,))
+    del nameless.scene_numbers
+    with pytest.raises(UserError, match="needs an environment with scene_numbers"):
+        select_pairs(nameless, classifier(), POOL, 5)
+
+
+def test_mode_of_the_judge_is_left_alone_and_progress_can_be_shown(capsys):
+    judge = classifier().train()
+    select_pairs(CounterWorld((4,)), judge, POOL, 5, progress=True)
+    assert judge.training and "pairs: 100%" in capsys.readouterr().err

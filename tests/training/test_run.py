@@ -1,0 +1,57 @@
+import csv
+
+import pytest
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.training import Run
+
+
+def test_a_stage_is_done_once_per_settings(tmp_path):
+    run = Run(tmp_path / "run")
+    assert run.stage("train", {"lr": 1}).result is None
+    run.stage("train", {"lr": 1}).finish({"loss": 0.5}, [{"step": 1.0}])
+    assert run.stage("train", {"lr": 1}).result == {"loss": 0.5}
+    assert run.stage("train", {"lr": 2}).result is None
+    assert (tmp_path / "run" / "metrics" / "train.json").exists()
+
+
+def test_a_stage_is_to_be_done_again_when_an_earlier_one_changed(tmp_path):
+    run = Run(tmp_path / "run")
+    run.stage("record", 1).finish({})
+    run.stage("label", "x", needs=["record"]).finish({})
+    assert run.stage("label", "x", needs=["record"]).result == {}
+    run.stage("record", 2).finish({})
+    assert run.stage("label", "x", needs=["record"]).result is None
+
+
+def test_what_is_missing_is_named_with_the_recipe_that_makes_it(tmp_path):
+    with pytest.raises(UserError, match=r"inverse\.safetensors is missing: run the recipe train_"):
+        Run(tmp_path / "run").need("inverse.safetensors", "train_inverse")
+
+
+def test_names_live_under_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path))
+    assert Run("mine").folder == tmp_path / "runs" / "mine"
+    assert Run(tmp_path / "elsewhere").folder == tmp_path / "elsewhere"
+
+
+def test_metrics_reach_the_csv_logger_once_also_after_a_kill(tmp_path):
+    run = Run(tmp_path / "run")
+    stage = run.stage("train", {})
+    log = stage.log()
+    log({"loss": 3.0}, 10)
+    log({"loss": 2.0}, 20)
+    stage.checkpoint.parent.mkdir(parents=True)
+    stage.checkpoint.touch()  # the run was killed after step 20, its checkpoint is of step 10
+    again = run.stage("train", {}).log()
+    again({"loss": 2.0}, 20)
+    again({"loss": 1.0}, 30)
+    (path,) = (tmp_path / "run" / "logs").rglob("loss.csv")
+    rows = [(int(row[0]), float(row[1])) for row in csv.reader(path.open()) if row]
+    assert rows == [(10, 3.0), (20, 2.0), (30, 1.0)]
+
+
+def test_an_unknown_logger_is_refused(tmp_path):
+    with pytest.raises(UserError, match="unknown logger 'paper'"):
+        Run(tmp_path, logger="paper")
+    assert Run(tmp_path, logger="none").stage("a", {}).log() is None

@@ -1,0 +1,91 @@
+import pytest
+import torch
+from torchrl.envs import Compose, TransformedEnv
+
+from ifo_grounding.training import select_pairs, self_examine
+from ifo_grounding.training.selection import BestPolicy, learned_returns
+from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
+from training.test_self_examination import (
+    POOL,
+    accepts_all,
+    config,
+    likes,
+    make_env,
+    make_networks,
+    simulator,
+)
+
+
+class Always(torch.nn.Module):
+    """Takes one action and stops after some steps."""
+
+    def __init__(self, action, steps):
+        super().__init__()
+        self.action, self.steps, self.taken = action, steps, 0
+
+    def forward(self, state):
+        self.taken += 1
+        action = self.action if self.taken <= self.steps else 5
+        return state.set("action", torch.full(state.batch_size, action))
+
+
+def test_each_start_counts_one_episode():
+    env = make_env(likes(1), num_envs=8)
+    like, dislike = 1 / (1 + torch.e**-4), 1 / (1 + torch.e**4)
+    returns = learned_returns(env, Always(1, steps=3), episodes=8, max_steps=40)
+    assert returns.tolist() == pytest.approx([3 * like + dislike] * 8, abs=1e-5)
+    cut = learned_returns(env, Always(1, steps=100), episodes=5, max_steps=6)
+    assert cut.tolist() == pytest.approx([6 * like] * 5, abs=1e-5)
+
+
+def test_only_a_clear_gain_replaces_the_best_policy():
+    layer = torch.nn.Linear(1, 1, bias=False)
+    best = BestPolicy(layer)
+    assert best.consider(torch.zeros(100))
+    first = layer.weight.clone()
+    with torch.no_grad():
+        layer.weight.add_(1)
+    noise = torch.randn(100, generator=torch.Generator().manual_seed(0))
+    assert not best.consider(noise - noise.mean())
+    best.restore()
+    assert torch.equal(layer.weight, first)
+    with torch.no_grad():
+        layer.weight.add_(2)
+    assert best.consider(torch.full((100,), 0.5))
+    other = BestPolicy(torch.nn.Linear(1, 1, bias=False))
+    other.load_state_dict(best.state_dict())
+    other.restore()
+    assert torch.equal(other.policy.weight, layer.weight)
+
+
+def test_a_run_that_only_gets_worse_ends_with_the_policy_of_phase_1():
+    """A huge learning rate ruins the policy; what phase 1 had learned is given back."""
+    policy, value = make_networks()
+    torch.nn.init.constant_(policy[0].module.head[-1].bias[1], 6.0)  # it does what the judge likes
+    before = {name: weight.clone() for name, weight in policy.state_dict().items()}
+    env = make_env(likes(1))
+    ruin = config(iterations=2, lr=1.0, select_every=1, select_episodes=32, max_steps=5)
+    history = self_examine(env, policy, value, ruin, seed=0)
+    assert [metrics["selected"] for metrics in history] == [0.0, 0.0]
+    assert all(torch.equal(w, before[n]) for n, w in policy.state_dict().items())
+
+
+def test_stored_pairs_are_looked_at_from_the_same_starts():
+    pairs = select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
+    env = TransformedEnv(simulator(8), Compose(StartingPairs(pairs), LearnedReward(likes(1))))
+    policy, value = make_networks()
+    frozen = config(iterations=3, value_warmup=3, select_every=1, select_episodes=16, max_steps=4)
+    history = self_examine(env, policy, value, frozen, seed=0)
+    assert len({metrics["selection_return"] for metrics in history}) == 1
+
+
+def test_looking_leaves_the_training_as_it_is():
+    runs = []
+    for select_every in (0, 1):
+        sampler = InstructionSampler(accepts_all(), POOL)
+        env = TransformedEnv(simulator(), Compose(sampler, LearnedReward(likes(1))))
+        networks = make_networks()
+        looked = config(iterations=3, select_every=select_every, select_episodes=16, max_steps=4)
+        history = self_examine(env, *networks, looked, seed=0)
+        runs.append([metrics["learned_reward"] for metrics in history])
+    assert runs[0] == runs[1]

@@ -1,0 +1,211 @@
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import Compose, TransformedEnv
+
+from ifo_grounding import keys
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import make_policy, make_reward_model, make_value
+from ifo_grounding.objectives import RewardLoss
+from ifo_grounding.tasks import grammar
+from ifo_grounding.training import Adversary, SelfExaminationConfig, select_pairs, self_examine
+from ifo_grounding.training.self_examination import summary
+from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
+
+SMALL = {"n_blocks": 1, "features": 16, "seed": 0}
+POOL = grammar("move").tokens
+
+
+def accepts_all():
+    def score(pixels, instruction):
+        return torch.full((*instruction.shape[:-1], 1), 5.0)
+
+    return TensorDictModule(score, [keys.PIXELS, keys.INSTRUCTION], [keys.SUITABILITY])
+
+
+def likes(action):
+    """A judge of actions that likes one of them."""
+
+    def score(pixels, instruction, taken):
+        return ((taken == action).float() * 8 - 4).unsqueeze(-1)
+
+    return TensorDictModule(
+        score, [keys.PIXELS, keys.INSTRUCTION, keys.ACTION], [keys.ACTION_SCORE]
+    )
+
+
+def simulator(num_envs=16, **kwargs):
+    return PickAndPlaceEnv("move", num_envs, seed=0, instructed=False, **kwargs)
+
+
+def make_env(judge=None, num_envs=16):
+    sampler = InstructionSampler(accepts_all(), POOL)
+    return TransformedEnv(simulator(num_envs), Compose(sampler, LearnedReward(judge or likes(1))))
+
+
+def make_networks():
+    policy = make_policy(simulator(1), **SMALL)
+    return policy, make_value(simulator(1), init_from=policy, **SMALL)
+
+
+def config(**kwargs):
+    chosen = {"iterations": 2, "steps": 8, "minibatch": 64, "value_warmup": 0, "epochs": 1}
+    return SelfExaminationConfig(**{**chosen, **kwargs})
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reinforce"])
+def test_a_policy_learns_what_the_judge_likes(algorithm):
+    """A judge that likes one action raises its share from about a sixth; the true reward is 0."""
+    env, (policy, value) = make_env(likes(1), num_envs=32), make_networks()
+    history = self_examine(
+        env,
+        policy,
+        value,
+        config(algorithm=algorithm, iterations=12, gamma=0.0, lr=3e-3, entropy=0.0, epochs=3),
+        seed=0,
+    )
+    assert history[0]["learned_reward"] < 0.35
+    assert history[-1]["learned_reward"] > 0.6
+
+
+def test_value_warm_up_leaves_the_policy_as_it_was():
+    env, (policy, value) = make_env(), make_networks()
+    before = {name: weight.clone() for name, weight in policy.state_dict().items()}
+    critic = {name: weight.clone() for name, weight in value.state_dict().items()}
+    self_examine(env, policy, value, config(value_warmup=2), seed=0)
+    assert all(torch.equal(w, before[n]) for n, w in policy.state_dict().items())
+    assert any(not torch.equal(w, critic[n]) for n, w in value.state_dict().items())
+
+
+def test_divergence_from_phase_1_costs_reward():
+    env = make_env(likes(1), num_envs=32)
+    free, held = [
+        self_examine(
+            env,
+            *make_networks(),
+            config(iterations=8, gamma=0.0, lr=3e-3, entropy=0.0, kl=kl),
+            seed=0,
+        )[-1]["learned_reward"]
+        for kl in (0.0, 10.0)
+    ]
+    assert held < free - 0.1
+
+
+def test_a_killed_run_continues_to_the_same_weights(tmp_path):
+    whole = make_networks()
+    expected = self_examine(make_env(), *whole, config(iterations=3), seed=0)
+
+    class Killed(BaseException):
+        pass
+
+    def kill(metrics, step):
+        if step == 2:
+            raise Killed
+
+    path = tmp_path / "run.pt"
+    with pytest.raises(Killed):
+        self_examine(
+            make_env(), *make_networks(), config(iterations=3), seed=0, checkpoint=path, log=kill
+        )
+    resumed, steps = make_networks(), []
+    history = self_examine(
+        make_env(),
+        *resumed,
+        config(iterations=3),
+        seed=0,
+        checkpoint=path,
+        log=lambda _, step: steps.append(step),
+    )
+    assert steps == [2, 3]
+    assert history == expected
+    for network, other in zip(whole, resumed, strict=True):
+        assert all(torch.equal(w, other.state_dict()[n]) for n, w in network.state_dict().items())
+
+
+def test_the_adversary_calls_the_policys_actions_wrong():
+    from ifo_grounding.data import labelled_buffer, record_demonstrations
+
+    demos, truth = record_demonstrations("move", 40, seed=0, keep_truth=True)
+    buffer = labelled_buffer(demos, truth.actions)
+    model = make_reward_model(simulator(1), **SMALL)
+    adversary = Adversary(RewardLoss(model), buffer, steps=4, lr=3e-3, batch_size=64)
+    policy, value = make_networks()
+    env = make_env(model)
+    history = self_examine(env, policy, value, config(iterations=3), seed=0, adversary=adversary)
+    first, last = history[0], history[-1]
+    assert last["reward/loss_reward"] < first["reward/loss_reward"]
+    assert last["reward/positive_probability"] > last["reward/negative_probability"]
+    state = adversary.state_dict()
+    other = Adversary(
+        RewardLoss(make_reward_model(simulator(1), n_blocks=1, features=16, seed=1)),
+        buffer,
+        1,
+        1e-3,
+    )
+    other.load_state_dict(state)
+    assert all(
+        torch.equal(w, other.loss.state_dict()[n]) for n, w in adversary.loss.state_dict().items()
+    )
+
+
+def test_stored_pairs_are_practised():
+    pairs = select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
+    env = TransformedEnv(simulator(8), Compose(StartingPairs(pairs), LearnedReward(likes(1))))
+    history = self_examine(env, *make_networks(), config(iterations=2), seed=0)
+    assert len(history) == 2
+    assert set(env.base_env.scene_numbers.tolist()) <= set(pairs["scene"].flatten().tolist())
+
+
+def test_no_true_reward_reaches_the_learner():
+    """The simulator would pay for success; what is learned from does not even hold that entry."""
+    seen = []
+
+    class Spy:
+        def __call__(self, batch):
+            seen.append(set(batch.keys(True, True)))
+            return {}
+
+        def state_dict(self):
+            return {}
+
+        def load_state_dict(self, state):
+            raise AssertionError
+
+    self_examine(make_env(), *make_networks(), config(iterations=1), seed=0, adversary=Spy())
+    assert (keys.NEXT, keys.LEARNED_REWARD) in seen[0]
+    assert (keys.NEXT, keys.REWARD) not in seen[0]
+    assert not any("state" in str(key) and "value" not in str(key) for key in seen[0])
+
+
+def test_envs_that_leak_or_lack_something_are_refused():
+    policy, value = make_networks()
+    with pytest.raises(UserError, match="never sees the true state"):
+        self_examine(simulator(expose_state=True), policy, value, config(), seed=0)
+    with pytest.raises(UserError, match="no instructions"):
+        self_examine(simulator(), policy, value, config(), seed=0)
+    sampled = TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))
+    with pytest.raises(UserError, match="no learned reward"):
+        self_examine(sampled, policy, value, config(), seed=0)
+
+
+@pytest.mark.parametrize("wrong", [{"algorithm": "dqn"}, {"iterations": 0}, {"minibatch": 0}])
+def test_impossible_configs_are_refused(wrong):
+    with pytest.raises(UserError):
+        SelfExaminationConfig(**wrong)
+
+
+def test_the_summary_counts_by_hand():
+    env = make_env()
+    batch = env.rollout(4, break_when_any_done=False, policy=None)
+    batch["next", "terminated"].zero_()
+    batch["next", "done"].zero_()
+    batch["next", "done"][0, 3] = True
+    batch["next", "terminated"][0, 3] = True
+    batch["next", "done"][1, 3] = True
+    batch["next", "learned_reward"].fill_(0.25)
+    said = summary(batch)
+    assert said["frames"] == 64
+    assert said["episode_length"] == 32
+    assert said["learned_return"] == 8.0
+    assert said["stopped"] == 0.5

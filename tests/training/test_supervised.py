@@ -1,0 +1,116 @@
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import Shapes, make_policy
+from ifo_grounding.objectives import ImitationLoss
+from ifo_grounding.training import FitConfig, fit
+from ifo_grounding.training.supervised import total_loss
+
+SHAPES = Shapes(image_shape=(3, 16, 16), vocabulary_size=10, tile_size=8)
+
+
+@pytest.fixture
+def buffer():
+    """Brightness of the picture and first word decide the action together."""
+    draw = torch.Generator().manual_seed(0)
+    bright = torch.randint(2, (256,), generator=draw)
+    word = torch.randint(2, (256,), generator=draw)
+    pixels = (bright * 255).to(torch.uint8).view(-1, 1, 1, 1).expand(-1, 3, 16, 16)
+    instruction = torch.zeros(256, 16, dtype=torch.int64)
+    instruction[:, 0] = 1 + word
+    data = {"pixels": pixels.clone(), "instruction": instruction, "action": 2 * bright + word}
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(256))
+    buffer.extend(TensorDict(data, [256]))
+    return buffer
+
+
+def imitation(dropout=0.0):
+    return ImitationLoss(make_policy(SHAPES, seed=0, n_blocks=1, features=16, dropout=dropout))
+
+
+def test_fit_learns_and_reports_each_iteration(buffer):
+    loss = imitation()
+    seen = []
+    config = FitConfig(steps=60, batch_size=64, lr=5e-3, iteration=20)
+    history = fit(loss, buffer, config, seed=0, log=lambda metrics, step: seen.append(step))
+    assert [metrics["step"] for metrics in history] == [20, 40, 60] == seen
+    assert history[-1]["loss_imitation"] < 0.1 < history[0]["loss_imitation"]
+    assert history[-1]["accuracy"] == 1.0
+    assert history[-1]["samples_per_second"] > 0
+
+
+def test_fit_is_a_function_of_its_seed(buffer):
+    config = FitConfig(steps=6, batch_size=32, iteration=3)
+    losses = [
+        [m["loss_imitation"] for m in fit(imitation(0.25), buffer, config, seed=seed)]
+        for seed in (0, 0, 1)
+    ]
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path):
+    config = FitConfig(steps=12, batch_size=32, iteration=3)
+    whole = imitation(0.25)
+    expected = fit(whole, buffer, config, seed=0)
+
+    class Killed(BaseException):
+        pass
+
+    def kill(metrics, step):
+        if step == 9:
+            raise Killed
+
+    path = tmp_path / "run.pt"
+    with pytest.raises(Killed):
+        fit(
+            imitation(0.25), buffer, config, seed=0, checkpoint=path, checkpoint_seconds=0, log=kill
+        )
+    resumed = imitation(0.25)
+    steps = []
+    history = fit(
+        resumed, buffer, config, seed=0, checkpoint=path, log=lambda _, step: steps.append(step)
+    )
+    assert steps == [9, 12]  # the iteration that was cut is done again
+    timeless = [{k: v for k, v in m.items() if k != "samples_per_second"} for m in history]
+    assert timeless == [{k: v for k, v in m.items() if k != "samples_per_second"} for m in expected]
+    for name, weight in whole.state_dict().items():
+        assert torch.equal(weight, resumed.state_dict()[name]), name
+
+
+def test_the_callback_runs_when_due_and_at_the_end(buffer):
+    config = FitConfig(steps=10, batch_size=16, iteration=2, evaluate_every=2)
+    called = []
+
+    def callback(step):
+        called.append(step)
+        return {"success": 0.5}
+
+    history = fit(imitation(), buffer, config, seed=0, callback=callback)
+    assert called == [4, 8, 10]
+    assert ["success" in metrics for metrics in history] == [False, True, False, True, True]
+
+
+def test_the_schedule_warms_up_and_ends_near_zero():
+    config = FitConfig(steps=100, warmup=0.1)
+    assert config.rate(0) == pytest.approx(0.1)
+    assert config.rate(9) == 1.0
+    assert config.rate(55) == pytest.approx(0.5 * (1 + math.cos(math.pi / 2)))
+    assert config.rate(99) < 0.001
+    assert FitConfig(schedule="constant").rate(1234) == 1.0
+
+
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"batch_size": -1}, {"schedule": "linear"}])
+def test_impossible_configs_are_refused(wrong):
+    with pytest.raises(UserError):
+        FitConfig(**wrong)
+
+
+def test_only_losses_are_minimised():
+    losses = TensorDict({"loss_a": torch.tensor(2.0), "loss_b": torch.tensor([1.0, 3.0])}, [])
+    losses["accuracy"] = torch.tensor(100.0)
+    assert total_loss(losses) == 4.0

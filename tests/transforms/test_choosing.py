@@ -1,0 +1,235 @@
+"""choose_instructions and PoolScorer, by hand-computed scores."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import generator
+from ifo_grounding.transforms import PoolScorer, choose_instructions
+from ifo_grounding.transforms.choosing import draw_candidates
+from transforms.counter_world import POOL, Suitability, Whole, classifier
+
+SURE = torch.tensor(3.0).sigmoid().item()
+
+
+def pixels(*numbers):
+    shade = torch.tensor(numbers, dtype=torch.uint8) * 20
+    return shade.view(-1, 1, 1, 1).expand(-1, 3, 8, 8)
+
+
+def choose(numbers, judge=None, **options):
+    judge = judge or classifier()
+    return choose_instructions(judge, POOL, pixels(*numbers), **options)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_chooses_only_above_the_threshold(whole):
+    chosen, score = choose([0, 5, 8, 9] * 50, classifier(whole=whole), generator=generator(0))
+    targets = chosen.view(50, 4)
+    assert (targets[:, 0] >= 1).all() and (targets[:, 1] >= 6).all()
+    assert (targets[:, 2] == 9).all() and (targets[:, 3] == -1).all()
+    assert targets[:, 0].unique().numel() == 9
+    assert score.view(50, 4)[0].tolist() == pytest.approx([SURE, SURE, SURE, 1 - SURE])
+
+
+def test_random_choice_is_uniform_over_the_suitable_ones():
+    chosen = choose([5] * 4000, generator=generator(3)).chosen
+    counts = chosen.bincount(minlength=10)
+    assert counts[:6].sum() == 0
+    assert ((counts[6:] - 1000).abs() < 130).all()  # four standard errors
+
+
+@pytest.mark.parametrize("candidates", [1, 3, 10])
+def test_random_choice_does_not_prefer_the_best(candidates):
+    judge = TensorDictModule(
+        lambda pixels, instruction: 2.0 + instruction[:, :1], ["pixels", "instruction"], ["logit"]
+    )
+    chosen = choose([0] * 3000, judge, candidates=candidates, generator=generator(1)).chosen
+    assert ((chosen.bincount(minlength=10) - 300).abs() < 80).all()  # five standard errors
+
+
+def test_best_takes_the_highest_logit():
+    judge = TensorDictModule(
+        lambda pixels, instruction: instruction[:, :1] * 1.0, ["pixels", "instruction"], ["logit"]
+    )
+    choices = choose([0, 1], judge, choose="best")
+    assert choices.chosen.tolist() == [9, 9]
+    assert choices.score.tolist() == pytest.approx([torch.tensor(10.0).sigmoid().item()] * 2)
+
+
+def test_threshold_is_on_the_probability():
+    judge = TensorDictModule(
+        lambda pixels, instruction: torch.full((len(pixels), 1), 1.38),
+        ["pixels", "instruction"],
+        ["x"],
+    )  # sigmoid(1.38) = 0.799
+    assert choose([0], judge, threshold=0.79).chosen[0] >= 0
+    assert choose([0], judge, threshold=0.8).chosen[0] == -1
+    assert choose([0], judge, threshold=0.0).chosen[0] >= 0
+
+
+def test_split_and_whole_judges_agree():
+    numbers = list(range(10)) * 3
+    split = choose(numbers, classifier(), generator=generator(5), candidates=4)
+    whole = choose(numbers, classifier(whole=True), generator=generator(5), candidates=4)
+    assert torch.equal(split.chosen, whole.chosen)
+    assert torch.allclose(split.score, whole.score)
+
+
+def test_inputs_in_the_other_order_are_understood():
+    judge = TensorDictModule(
+        lambda instruction, pixels: Suitability().eval()(pixels, instruction),
+        ["instruction", "pixels"],
+        ["suitability"],
+    )
+    assert choose([8, 9], judge).chosen.tolist() == [9, -1]
+
+
+def test_a_sequence_of_modules_is_not_split():
+    inverted = TensorDictModule(lambda logit: -logit, ["suitability"], ["suitability"])
+    judge = TensorDictSequential(classifier(), inverted)
+    assert choose([0, 1], judge, candidates=64).chosen.tolist()[0] == 0
+
+
+def test_each_instruction_is_encoded_once_until_a_weight_changes():
+    judge = classifier()
+    network = judge.module
+    scorer = PoolScorer(judge, POOL)
+    for _ in range(3):
+        choose_instructions(scorer, None, pixels(*range(9)))
+    assert network.encoded == 10
+    with torch.no_grad():
+        network.sharpness.add_(1.0)
+    logits = scorer.score(scorer.encode(pixels(0)), torch.tensor([[0, 9]]))
+    assert network.encoded == 20
+    assert logits.tolist() == [[-4.0, 4.0]]
+    # Updates through .data, as collectors send them, count too.
+    network.sharpness.data.fill_(2.0)
+    assert scorer.score(scorer.encode(pixels(0)), torch.tensor([[0, 9]])).tolist() == [[-2.0, 2.0]]
+    assert network.encoded == 30
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_optimizer_steps_refresh_the_encodings(fused):
+    judge = classifier().eval()
+    scorer = PoolScorer(judge, POOL)
+    optimizer = torch.optim.Adam(judge.parameters(), lr=1.0, fused=fused)
+    before = scorer.score(scorer.encode(pixels(0)), torch.tensor([[9]])).item()
+    judge.module.sharpness.grad = torch.tensor(-1.0)
+    optimizer.step()
+    assert scorer.score(scorer.encode(pixels(0)), torch.tensor([[9]])).item() == pytest.approx(
+        before + 1, abs=1e-4
+    )
+
+
+def test_mode_is_eval_while_scoring_and_restored():
+    judge = classifier()
+    judge.train()
+    judge.module.dropout.eval()
+    modes = []
+    judge.module.dropout.register_forward_hook(lambda part, *_: modes.append(part.training))
+    assert choose([0] * 20, judge).chosen.min() > 0
+    assert modes and not any(modes)
+    assert judge.training and judge.module.training and not judge.module.dropout.training
+
+
+def test_mode_is_restored_after_an_error():
+    class Broken(torch.nn.Module):
+        def forward(self, pixels, instruction):
+            raise ArithmeticError
+
+    judge = TensorDictModule(Broken(), ["pixels", "instruction"], ["suitability"]).train()
+    with pytest.raises(ArithmeticError):
+        choose([0], judge)
+    assert judge.training and judge.module.training
+
+
+def test_no_gradient_is_kept():
+    assert not choose([0], classifier()).score.requires_grad
+
+
+def test_large_batches_are_scored_in_parts():
+    sizes = []
+
+    class Sized(Whole):
+        def forward(self, pixels, instruction):
+            sizes.append(len(pixels))
+            return super().forward(pixels, instruction)
+
+    judge = TensorDictModule(Sized(Suitability()), ["pixels", "instruction"], ["suitability"])
+    assert len(choose([8] * 1000, judge).chosen) == 1000
+    assert max(sizes) <= 2048 and 5_000 < sum(sizes) <= 10_000
+
+
+def test_a_random_choice_scores_no_more_than_it_needs():
+    scorer = PoolScorer(classifier(), POOL)
+    choose_instructions(scorer, None, pixels(*[0] * 100))
+    assert 400 <= scorer.scored < 500
+    choose_instructions(scorer, None, pixels(*[0] * 100), choose="best")
+    assert scorer.scored >= 1400
+
+
+def test_candidates_are_distinct_and_uniform():
+    index = draw_candidates(3000, 20, 6, generator(0))
+    assert index.shape == (3000, 6)
+    assert (index.sort(1).values.diff(dim=1) > 0).all()
+    for place in index.T:
+        assert ((place.bincount(minlength=20) - 150).abs() < 60).all()  # five standard errors
+    assert draw_candidates(2, 3, 6, None).sort(1).values.tolist() == [[0, 1, 2], [0, 1, 2]]
+
+
+def test_no_states_no_choices():
+    choices = choose([])
+    assert choices.chosen.shape == (0,) and choices.score.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"threshold": 1.0}, "threshold is a probability"),
+        ({"threshold": -0.1}, "threshold is a probability"),
+        ({"candidates": 0}, "candidates must be at least 1"),
+        ({"choose": "worst"}, "unknown choose 'worst'"),
+    ],
+)
+def test_impossible_options(options, message):
+    with pytest.raises(UserError, match=message):
+        choose([0], **options)
+
+
+@pytest.mark.parametrize(
+    ("pool", "message"),
+    [
+        (torch.zeros(0, 4).long(), "pool is empty"),
+        (torch.zeros(3, 4), "pool must be token ids"),
+        (torch.zeros(4).long(), "pool must be token ids"),
+        ([["a"]], "pool must be token ids"),
+        (None, "needs a pool"),
+    ],
+)
+def test_impossible_pools(pool, message):
+    with pytest.raises(UserError, match=message):
+        choose_instructions(classifier(), pool, pixels(0))
+
+
+def test_impossible_judges():
+    with pytest.raises(UserError, match="expected a TensorDictModule"):
+        choose([0], Suitability())
+    one_input = TensorDictModule(lambda pixels: pixels, ["pixels"], ["suitability"])
+    with pytest.raises(UserError, match="reads pixels and an instruction"):
+        choose([0], one_input)
+    keys = ["pixels", "instruction"]
+    unclear = TensorDictModule(lambda a, b: (a, b), keys, ["x", "y"])
+    with pytest.raises(UserError, match="must be named 'suitability'"):
+        choose([0], unclear)
+    wide = TensorDictModule(lambda a, b: torch.zeros(len(a), 2), keys, ["suitability"])
+    with pytest.raises(UserError, match=r"must have shape \[4, 1\], got \[4, 2\]"):
+        choose([0], wide)
+    diverged = TensorDictModule(
+        lambda a, b: torch.full((len(a), 1), torch.nan), keys, ["suitability"]
+    )
+    with pytest.raises(UserError, match="not a number"):
+        choose([0], diverged)

@@ -1,0 +1,224 @@
+"""What TorchRL asks of a transform: single, serial, parallel, composed, nested, collected."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.testing import rollout_consistency_assertion
+
+from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
+from transforms.counter_world import (
+    POOL,
+    STOP,
+    CounterWorld,
+    action_judge,
+    classifier,
+    goal_judge,
+    shown,
+)
+
+PAIRS = TensorDict(  # number shown by scene n: 7 n mod 10; the instruction asks for one more
+    {
+        "scene": torch.arange(20).unsqueeze(-1),
+        "instruction": torch.stack([POOL[(n * 7 % 10 + 1) % 10] for n in range(20)]),
+    },
+    [20],
+)
+
+
+def sampler(nested=False):
+    options = {"in_keys": [("agent", "pixels")], "out_keys": [("agent", "instruction")]}
+    return InstructionSampler(classifier(nested), POOL, **(options if nested else {}))
+
+
+def paid(nested=False):
+    keys = {}
+    if nested:
+        keys = {
+            "reward_key": ("agent", "learned_reward"),
+            "pixels_key": ("agent", "pixels"),
+            "initial_pixels_key": ("agent", "initial_pixels"),
+        }
+    return LearnedReward(
+        action_judge(nested),
+        kind="both",
+        goal_model=goal_judge(nested),
+        stop_action=STOP,
+        **keys,
+    )
+
+
+def pairs():
+    return StartingPairs(PAIRS)
+
+
+MAKERS = {
+    "sampler": lambda: [sampler()],
+    "sampler and reward": lambda: [sampler(), paid()],
+    "reward and sampler": lambda: [paid(), sampler()],
+    "pairs": lambda: [pairs()],
+    "pairs and reward": lambda: [pairs(), paid()],
+}
+OUTSIDE = ("sampler", "sampler and reward", "reward and sampler")
+
+
+def inside(name, batch=(2,)):
+    parts = MAKERS[name]()
+    return TransformedEnv(CounterWorld(batch), parts[0] if len(parts) == 1 else Compose(*parts))
+
+
+def consistent(rollout, name):
+    """Check what must hold of any rollout, however its environment was put together."""
+    started = torch.ones(rollout.shape, dtype=torch.bool)
+    started[..., 1:] = rollout["next", "done"][..., :-1, 0]
+    assert started[..., 1:].any()
+    suitable = rollout["instruction"][..., 0] - 1 > shown(rollout["pixels"])
+    if "pairs" in name:  # 9 shown asks for 0
+        suitable |= shown(rollout["pixels"]) == 9
+    assert suitable[started].all()
+    assert torch.equal(rollout["next", "instruction"], rollout["instruction"])
+    kept = (rollout["instruction"][..., 1:, :] == rollout["instruction"][..., :-1, :]).all(-1)
+    assert kept[~started[..., 1:]].all()
+    if "reward" in name:
+        assert torch.equal(rollout["initial_pixels"][started], rollout["pixels"][started])
+        expected = paid()(rollout.exclude(("next", "learned_reward")).clone())
+        assert torch.equal(
+            expected["next", "learned_reward"], rollout["next", "learned_reward"].clone()
+        )
+
+
+def check(env, name):
+    try:
+        check_env_specs(env, break_when_any_done="both")
+        rollout = env.rollout(20, break_when_any_done=False)
+        consistent(rollout, name)
+        flat = rollout.reshape(-1, rollout.shape[-1])
+        for key in ("pixels", "instruction"):
+            rollout_consistency_assertion(flat, observation_key=key, done_strict=True)
+    finally:
+        env.close()
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:A lambda function was passed to ParallelEnv")
+
+
+@pytest.mark.parametrize("name", MAKERS)
+class TestContract:
+    @pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 3)])
+    def test_single(self, name, batch):
+        check(inside(name, batch), name)
+
+    @pytest.mark.parametrize("batch", [(), (3,)])
+    def test_serial_inside(self, name, batch):
+        check(SerialEnv(2, lambda: inside(name, batch)), name)
+
+    def test_serial_inside_a_plain_transformed_env(self, name):
+        check(TransformedEnv(SerialEnv(2, lambda: inside(name))), name)
+
+    def test_parallel_inside(self, name):
+        check(ParallelEnv(2, lambda: inside(name), mp_start_method="fork"), name)
+
+    def test_parallel_inside_a_plain_transformed_env(self, name):
+        # Workers are reset by a command of their own here, which reaches them without entries.
+        check(TransformedEnv(ParallelEnv(2, lambda: inside(name), mp_start_method="fork")), name)
+
+    def test_stops_at_the_first_done(self, name):
+        rollout = inside(name).rollout(20, break_when_any_done=True)
+        assert rollout["next", "done"][:, -1].any() and not rollout["next", "done"][:, :-1].any()
+
+    @pytest.mark.parametrize("total", [30, 200])
+    def test_collected(self, name, total):
+        collector = Collector(inside(name, (4,)), frames_per_batch=total, total_frames=2 * total)
+        batches = list(collector)
+        collector.shutdown()
+        for batch in batches:
+            assert torch.equal(batch["next", "instruction"], batch["instruction"])
+
+    def test_moves_to_a_device_and_back(self, name):
+        env = inside(name).to("cpu")
+        consistent(env.rollout(20, break_when_any_done=False), name)
+
+    def test_fake_and_real_data_have_the_same_keys(self, name):
+        env = inside(name)
+        fake = set(env.fake_tensordict().keys(True, True))
+        assert fake == set(env.rand_step(env.reset()).keys(True, True))
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+class TestOutside:
+    @pytest.mark.parametrize("batch", [(), (3,)])
+    def test_serial(self, name, batch):
+        env = TransformedEnv(SerialEnv(2, lambda: CounterWorld(batch)), Compose(*MAKERS[name]()))
+        check(env, name)
+
+    def test_parallel(self, name):
+        workers = ParallelEnv(2, lambda: CounterWorld((2,)), mp_start_method="fork")
+        check(TransformedEnv(workers, Compose(*MAKERS[name]())), name)
+
+
+@pytest.mark.parametrize("order", [(sampler, paid), (paid, sampler)])
+def test_nested_keys(order):
+    world = CounterWorld((3,), nested=True)
+    env = TransformedEnv(world, Compose(*(make(nested=True) for make in order)))
+    check_env_specs(env, break_when_any_done="both")
+    rollout = env.rollout(30, break_when_any_done=False)
+    assert rollout["agent", "instruction"].shape == (3, 30, 4)
+    gap = rollout["agent", "instruction"][..., 0] - 1 - shown(rollout["agent", "pixels"])
+    wanted = torch.where(gap > 0, 0, torch.where(gap < 0, 1, STOP))
+    right = wanted == rollout["action"]
+    going = rollout["action"] != STOP
+    expected = torch.where(right, torch.tensor(2.0).sigmoid(), torch.tensor(-1.0).sigmoid())
+    got = rollout["next", "agent", "learned_reward"][..., 0]
+    assert torch.allclose(got[going], expected[going])
+    assert (got[~going] > expected[~going]).all()
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_partial_reset_inside_workers(name):
+    env = SerialEnv(2, lambda: inside(name, (3,)))
+    tensordict = env.rand_step(env.reset())["next"].exclude("reward", "learned_reward")
+    mask = torch.tensor([[0, 1, 0], [0, 0, 1]]).bool().unsqueeze(-1)
+    after = env.reset(tensordict.clone().set("_reset", mask.clone()))
+    for key in set(after.keys()) - {"done", "terminated", "truncated"}:
+        assert torch.equal(after[key][~mask[..., 0]], tensordict[key][~mask[..., 0]]), key
+
+
+def test_pairs_outside_of_workers_are_refused():
+    env = TransformedEnv(SerialEnv(2, CounterWorld), pairs())
+    with pytest.raises(ValueError, match="cannot reach the simulators through a SerialEnv"):
+        env.reset()
+
+
+def test_as_a_module():
+    states = CounterWorld((6,)).reset().select("pixels")
+    states = states[shown(states["pixels"]) < 9]
+    chosen = sampler()(states)
+    assert (chosen["instruction"][:, 0] - 1 > shown(chosen["pixels"])).all()
+    model = torch.nn.Sequential(sampler(), LearnedReward(action_judge()))
+    batch = model(states.set("action", torch.zeros(len(states)).long()))
+    assert torch.allclose(batch["next", "learned_reward"], torch.tensor(2.0).sigmoid())
+
+
+def test_on_a_replay_buffer():
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=10)
+    for transform in (sampler(), LearnedReward(action_judge())):
+        buffer.append_transform(transform)
+    buffer.extend(
+        TensorDict(
+            {
+                "pixels": torch.zeros(50, 3, 8, 8, dtype=torch.uint8),
+                "action": torch.zeros(50).long(),
+            },
+            [50],
+        )
+    )
+    assert torch.allclose(buffer.sample()["next", "learned_reward"], torch.tensor(2.0).sigmoid())
+    stored = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(9), batch_size=9, transform=StartingPairs(PAIRS)
+    )
+    stored.extend(TensorDict({"pixels": torch.ones(9, 3)}, [9]))
+    assert set(stored.sample().keys()) == {"pixels", "index"}

@@ -1,0 +1,278 @@
+"""InstructionSampler: what it writes, whose states it redraws, whom it refuses."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Categorical, Composite
+from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.transforms import InstructionSampler, NothingSuitableError
+from transforms.counter_world import POOL, CounterWorld, classifier, shown
+
+
+def make(batch=(4,), *before, judge=None, pool=POOL, world=None, **options):
+    sampler = InstructionSampler(judge or classifier(), pool, **options)
+    world = world or CounterWorld(batch)
+    return TransformedEnv(world, Compose(*before, sampler) if before else sampler)
+
+
+def suits(tensordict):
+    return tensordict["instruction"][..., 0] - 1 > shown(tensordict["pixels"])
+
+
+def reset_rows(env, tensordict, *rows):
+    mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
+    mask[list(rows)] = True
+    return env.reset(tensordict.clone().set("_reset", mask))
+
+
+def test_every_start_suits_and_the_instruction_lasts_the_episode():
+    env = make((16,))
+    rollout = env.rollout(40, break_when_any_done=False)
+    assert rollout["instruction"].shape == (16, 40, 4)
+    starts = torch.ones(16, 40, dtype=torch.bool)
+    starts[:, 1:] = rollout["next", "done"][:, :-1, 0]
+    assert starts.sum() > 100
+    assert suits(rollout[starts]).all()
+    assert torch.equal(rollout["next", "instruction"], rollout["instruction"])
+    same = (rollout["instruction"][:, 1:] == rollout["instruction"][:, :-1]).all(-1)
+    assert same[~starts[:, 1:]].all() and not same[starts[:, 1:]].all()
+
+
+def test_unsuitable_states_are_drawn_again_for_those_rows_only():
+    world = CounterWorld((10,))  # its ten scenes show ten numbers: only 9 has no instruction
+    env = make(world=world)
+    tensordict = env.reset()
+    assert world.resets.tolist().count(2) == 1 and world.resets.sum() == 11
+    assert suits(tensordict).all()
+    assert torch.equal(shown(tensordict["pixels"]), world.number)
+
+
+def test_a_first_state_that_suits_is_kept():
+    kept = make(world=CounterWorld((10,))).reset()["pixels"]
+    plain = CounterWorld((10,)).reset()["pixels"]
+    alike = (shown(kept) == shown(plain)).tolist()
+    assert alike.count(False) == 1 and shown(plain)[alike.index(False)] == 9
+
+
+@pytest.mark.parametrize("rows", [(0,), (1, 3), (0, 1, 2, 3)])
+def test_partial_resets_touch_their_rows_only(rows):
+    env = make((4,), StepCounter())
+    tensordict = env.rollout(3, policy=go_up, break_when_any_done=False)[:, -1]["next"]
+    after = reset_rows(env, tensordict.exclude("reward"), *rows)
+    others = [row for row in range(4) if row not in rows]
+    for key in ("pixels", "instruction", "step_count"):
+        assert torch.equal(after[key][others], tensordict[key][others]), key
+    assert (after["step_count"][list(rows)] == 0).all()
+    assert suits(after[list(rows)]).all()
+
+
+def go_up(tensordict):
+    return tensordict.set("action", torch.zeros(tensordict.batch_size, dtype=torch.int64))
+
+
+def test_redrawing_lets_earlier_transforms_see_the_new_state():
+    env = make((10,), StepCounter(), RewardSum())
+    tensordict = env.reset()
+    assert (tensordict["step_count"] == 0).all() and suits(tensordict).all()
+
+
+def test_same_seed_same_choices():
+    def choices(seed):
+        env = make((8,), candidates=3, seed=seed)
+        return env.rollout(20, policy=go_up, break_when_any_done=False)["instruction"]
+
+    assert torch.equal(choices(1), choices(1))
+    assert not torch.equal(choices(1), choices(2))
+
+
+def test_choices_leave_the_global_generator_alone():
+    torch.manual_seed(4)
+    expected = torch.rand(3)
+    torch.manual_seed(4)
+    make((8,)).reset()
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_state_dict_resumes_the_choices():
+    env, other = make((8,)), make((8,), seed=9)
+    env.reset()
+    other.reset()
+    other.load_state_dict(env.state_dict())
+    assert torch.equal(env.reset()["instruction"], other.reset()["instruction"])
+    env.transform.set_seed(3)
+    other.transform.set_seed(3)
+    env.base_env.set_seed(0)
+    other.base_env.set_seed(0)
+    assert torch.equal(env.reset()["instruction"], other.reset()["instruction"])
+
+
+def test_copies_draw_alike_and_apart():
+    sampler = InstructionSampler(classifier(), POOL)
+    TransformedEnv(CounterWorld((6,)), sampler).reset()
+    sampler.reset_parent()
+    sampler.set_seed(0)
+    for twin in (copy.deepcopy(sampler), pickle.loads(pickle.dumps(sampler))):
+        assert twin.scorer.classifier is twin.classifier
+        assert twin.classifier is not sampler.classifier
+        env, other = (TransformedEnv(CounterWorld((6,)), one) for one in (sampler.clone(), twin))
+        assert torch.equal(env.reset()["instruction"], other.reset()["instruction"])
+        sampler.set_seed(0)
+
+
+def test_stats_count_and_start_anew():
+    env = make(world=CounterWorld((10,)), candidates=4, pool=POOL)
+    env.reset()
+    stats = env.transform.stats()
+    assert stats["states_served"] == 10
+    assert stats["states_drawn"] == env.base_env.resets.sum()
+    assert stats["served_share"] == 10 / stats["states_drawn"]
+    assert 10 <= stats["candidates_scored"] <= 4 * stats["states_drawn"]
+    assert stats["mean_score"] == pytest.approx(torch.tensor(3.0).sigmoid().item())
+    assert set(env.transform.stats().values()) == {0.0}
+
+
+def test_nothing_suitable_is_one_clear_line():
+    judge = TensorDictModule(
+        lambda pixels, instruction: torch.full((len(pixels), 1), 0.532),
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+    world = CounterWorld((3,))
+    with pytest.raises(NothingSuitableError) as caught:
+        make(world=world, judge=judge, max_tries=7).reset()
+    message = str(caught.value)
+    for part in ("above 0.8", "7 states", "best score seen in this reset: 0.63", "lower threshold"):
+        assert part in message
+    assert "\n" not in message
+    assert world.resets.tolist() == [7, 7, 7]
+    assert isinstance(caught.value, UserError) and isinstance(caught.value, RuntimeError)
+
+
+def test_duplicates_count_once():
+    sampler = InstructionSampler(classifier(), POOL.repeat(3, 1))
+    assert len(sampler.pool) == 10
+
+
+def test_mode_of_the_judge_is_left_alone():
+    judge = classifier().train()
+    env = make(judge=judge)
+    env.rollout(10, break_when_any_done=False)
+    assert judge.training and judge.module.dropout.training
+    env.eval()
+    assert judge.training
+    judge.eval()
+    env.train()
+    env.reset()
+    assert not judge.training
+
+
+def test_trained_weights_are_used_at_once():
+    judge = classifier()
+    env = make(judge=judge, max_tries=3)
+    env.reset()
+    with torch.no_grad():
+        judge.module.sharpness.fill_(1.0)  # now every probability is below 0.8
+    with pytest.raises(NothingSuitableError):
+        env.reset()
+
+
+def test_weights_reach_an_environment_by_its_state_dict():
+    env, other = make(), make()
+    with torch.no_grad():
+        env.transform.classifier.module.sharpness.fill_(5.0)
+    other.load_state_dict(env.state_dict())
+    assert other.transform.classifier.module.sharpness == 5.0
+
+
+def test_specs_are_those_of_an_instructed_environment():
+    judge = TensorDictModule(
+        lambda pixels, instruction: torch.full((len(pixels), 1), 9.0),
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+    world = PickAndPlaceEnv("move", num_envs=5, seed=0, instructed=False)
+    env = make(world=world, judge=judge, pool=torch.ones(1, 16).long())
+    instructed = PickAndPlaceEnv("move", num_envs=5, seed=0)
+    assert env.observation_spec["instruction"] == instructed.observation_spec["instruction"]
+    assert env.state_spec["instruction"] == env.observation_spec["instruction"]
+    assert make(vocabulary_size=50).observation_spec["instruction"].high.max() == 49
+    assert make().observation_spec["instruction"].high.max() == 10
+    with pytest.raises(UserError, match="token id 10, but the vocabulary has 5 ids"):
+        _ = make(vocabulary_size=5).observation_spec
+
+
+def test_environments_that_show_their_state_are_refused():
+    for world in (
+        CounterWorld((2,), expose_state=True),
+        PickAndPlaceEnv("move", num_envs=2, instructed=False, expose_state=True),
+        SerialEnv(2, lambda: CounterWorld((2,), expose_state=True)),
+    ):
+        with pytest.raises(UserError, match="exposes its true state"):
+            make(world=world).reset()
+
+
+def test_workers_with_carried_entries_are_no_exposed_state():
+    world = SerialEnv(2, lambda: TransformedEnv(CounterWorld((2,)), StepCounter()))
+    assert suits(make(world=world).reset()).all()
+
+
+def test_instructed_environments_are_refused():
+    with pytest.raises(UserError, match="already writes 'instruction'"):
+        make(world=CounterWorld((2,), instructed=True)).reset()
+
+
+def test_stepping_without_an_instruction_says_so():
+    env = make()
+    tensordict = env.reset().exclude("instruction")
+    with pytest.raises(UserError, match="step from what reset"):
+        env.step(go_up(tensordict))
+
+
+def test_agents_with_several_dones_are_refused():
+    class Split(CounterWorld):
+        def __init__(self):
+            super().__init__((2,))
+            flag = Categorical(2, shape=(2, 1), dtype=torch.bool)
+            agents = {
+                name: Composite(done=flag.clone(), terminated=flag.clone(), shape=(2,))
+                for name in ("a", "b")
+            }
+            self.done_spec = Composite(agents, shape=(2,))
+
+    sampler = InstructionSampler(classifier(), POOL)
+    env = TransformedEnv(Split(), sampler)
+    assert len(env.reset_keys) == 2
+    with pytest.raises(UserError, match="one done entry"):
+        _ = sampler.reset_key
+
+
+@pytest.mark.parametrize("options", [{"max_tries": 0}, {"threshold": 2.0}, {"choose": "first"}])
+def test_impossible_options(options):
+    with pytest.raises(UserError):
+        make(**options)
+
+
+def test_called_on_states_it_chooses_for_each():
+    world = CounterWorld((10,))
+    states = world.reset().select("pixels").view(2, 5)
+    sampler = InstructionSampler(classifier(), POOL)
+    with pytest.raises(NothingSuitableError, match="1 of 10 states"):
+        sampler(states)
+    kept = states[shown(states["pixels"]) < 9]
+    assert suits(sampler(kept)).all()
+
+
+def test_without_a_simulator_no_state_is_drawn_again():
+    sampler = InstructionSampler(classifier(), POOL)
+    first = TensorDict({"pixels": torch.full((1, 3, 8, 8), 180, dtype=torch.uint8)}, [1])
+    with pytest.raises(UserError, match="needs an environment"):
+        sampler._reset(first.empty(), first)

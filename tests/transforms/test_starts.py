@@ -1,0 +1,152 @@
+"""StartingPairs: every pair once, with its own scene, before any is used again."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, StepCounter, TransformedEnv
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.transforms import LearnedReward, StartingPairs, frame_hash
+from transforms.counter_world import CounterWorld, action_judge
+
+
+def make_pairs(count=7, length=4):
+    scene = torch.arange(count).unsqueeze(-1) * 3 + 1
+    instruction = torch.ones(count, length, dtype=torch.int64)
+    instruction[:, 1] = scene[:, 0]  # tells which scene it belongs to
+    return TensorDict({"scene": scene, "instruction": instruction}, [count])
+
+
+def make(batch=(4,), pairs=None, seed=0, world=None, **options):
+    transform = StartingPairs(make_pairs() if pairs is None else pairs, seed=seed, **options)
+    return TransformedEnv(world or CounterWorld(batch), transform)
+
+
+def starts(env, resets):
+    """Scenes that full resets begin with, checked against their instructions."""
+    scenes = []
+    for _ in range(resets):
+        instruction = env.reset()["instruction"].reshape(-1, 4)
+        assert torch.equal(instruction[:, 1], env.scene_numbers)
+        scenes += instruction[:, 1].tolist()
+    return scenes
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (4,), (2, 5)])
+def test_each_pair_is_used_once_before_any_again(batch):
+    env = make(batch)
+    scenes = starts(env, 70)
+    for begin in range(0, len(scenes) - 6, 7):
+        assert sorted(scenes[begin : begin + 7]) == list(range(1, 22, 3))
+
+
+def test_order_is_new_in_each_epoch_and_a_function_of_the_seed():
+    first = starts(make((7,)), 5)
+    epochs = {tuple(first[begin : begin + 7]) for begin in range(0, 35, 7)}
+    assert len(epochs) == 5
+    assert starts(make((7,)), 5) == first
+    assert starts(make((7,), seed=1), 5) != first
+    assert starts(make((5,)), 7) == first
+
+
+def test_episodes_begin_with_pairs_and_keep_the_instruction():
+    env = make((4,))
+    rollout = env.rollout(60, break_when_any_done=False)
+    started = torch.ones(4, 60, dtype=torch.bool)
+    started[:, 1:] = rollout["next", "done"][:, :-1, 0]
+    scene = rollout["instruction"][..., 1]
+    number = rollout["pixels"][..., 0, 0, 0] // 20
+    assert (number[started] == scene[started] * 7 % 10).all()
+    assert torch.equal(rollout["next", "instruction"], rollout["instruction"])
+    counts = Counter(scene[started].tolist())
+    assert len(counts) == 7 and max(counts.values()) - min(counts.values()) <= 1
+
+
+def test_partial_resets_touch_and_use_up_their_rows_only():
+    env = make((4,))
+    tensordict = env.reset()
+    used, scenes = env.transform.used, env.scene_numbers.clone()
+    mask = torch.tensor([[False], [True], [False], [False]])
+    after = env.reset(tensordict.clone().set("_reset", mask.clone()))
+    assert env.transform.used == used + 1
+    others = [0, 2, 3]
+    assert torch.equal(env.scene_numbers[others], scenes[others])
+    for key in ("pixels", "instruction"):
+        assert torch.equal(after[key][others], tensordict[key][others]), key
+    assert after["instruction"][1, 1] == env.scene_numbers[1] != scenes[1]
+
+
+def test_state_dict_resumes_the_order():
+    env, other = make((4,)), make((4,), seed=5)
+    starts(env, 3)
+    other.load_state_dict(env.state_dict())
+    assert starts(env, 10) == starts(other, 10)
+
+
+def test_composes_with_other_transforms():
+    transforms = Compose(StepCounter(), StartingPairs(make_pairs()), LearnedReward(action_judge()))
+    env = TransformedEnv(CounterWorld((3,)), transforms)
+    rollout = env.rollout(30, break_when_any_done=False)
+    assert rollout["next", "learned_reward"].shape == (3, 30, 1)
+    assert (rollout["instruction"][..., 1] % 3 == 1).all()
+
+
+def test_the_real_world_begins_with_the_scenes():
+    pairs = make_pairs(5, 16)
+    world = PickAndPlaceEnv("move", num_envs=5, seed=3, instructed=False)
+    pairs["frame_hash"] = frame_hash(
+        world.reset(TensorDict({"scene": pairs["scene"]}, [5]))["pixels"]
+    )
+    env = make(pairs=pairs, world=PickAndPlaceEnv("move", num_envs=2, seed=3, instructed=False))
+    for _ in range(5):
+        instruction = env.reset()["instruction"]
+        assert torch.equal(instruction[:, 1], env.scene_numbers)
+    assert env.observation_spec["instruction"].high.max() == world.vocabulary_size - 1
+
+
+def test_other_scenes_than_the_stored_ones_are_noticed():
+    pairs = make_pairs()
+    world = CounterWorld((7,), seed=1)
+    first = world.reset(TensorDict({"scene": pairs["scene"]}, [7]))["pixels"]
+    pairs["frame_hash"] = frame_hash(first).unsqueeze(-1)
+    make(pairs=pairs, world=CounterWorld((4,), seed=1)).rollout(30, break_when_any_done=False)
+    with pytest.raises(UserError, match="looks other than when its pair was stored"):
+        make(pairs=pairs, world=CounterWorld((4,), seed=2)).reset()
+
+
+def test_frame_hash_tells_images_apart():
+    generator = torch.Generator().manual_seed(0)
+    images = torch.randint(2, (3000, 3, 5, 5), generator=generator, dtype=torch.uint8) * 255
+    images = images.unique(dim=0)
+    assert frame_hash(images).unique().numel() == len(images)
+    assert torch.equal(frame_hash(images), frame_hash(images.clone()))
+    swapped = images[:, :, :, [1, 0, 2, 3, 4]]
+    differs = (swapped != images).flatten(1).any(1)
+    assert (frame_hash(swapped) != frame_hash(images))[differs].all()
+
+
+def test_environments_that_do_not_suit_are_refused():
+    with pytest.raises(UserError, match="exposes its true state"):
+        make(world=CounterWorld((2,), expose_state=True)).reset()
+    with pytest.raises(UserError, match="already writes 'instruction'"):
+        make(world=CounterWorld((2,), instructed=True)).reset()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        (make_pairs().exclude("scene"), r"pairs lack \['scene'\]"),
+        (make_pairs().exclude("instruction"), r"pairs lack \['instruction'\]"),
+        (make_pairs()[:0], "pool is empty"),
+        (make_pairs().set("scene", torch.rand(7, 1)), "scene must be int64"),
+        (make_pairs().set("scene", torch.ones(7, 2).long()), "scene must be int64"),
+    ],
+)
+def test_impossible_pairs(pairs, message):
+    with pytest.raises(UserError, match=message):
+        StartingPairs(pairs)
