@@ -38,6 +38,7 @@ def evaluate(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     run = stage.run
+    run.need(POLICIES[0], "imitate")
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
     results: dict[str, Any] = {"labels": run.record("label")["result"]["accuracy"]}
     results |= evaluate_policies(run, options)
@@ -50,7 +51,6 @@ def evaluate(options: DictConfig) -> dict:
 def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
     """Measure success of the policy of each phase on the same fixed scenes, and the difference."""
     section = options.evaluate
-    run.need(POLICIES[0], "imitate")
     measured = [
         success_rate(
             load_network(run, file, "imitate", options),

@@ -1,5 +1,7 @@
 """Both phases on one task, and a report: the main job."""
 
+import sys
+
 from _shared import open_run, plain
 from collect_transitions import collect
 from evaluate import evaluate
@@ -15,7 +17,7 @@ from train_reward import train_reward
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.files import write_json
-from ifo_grounding.report import results_table
+from ifo_grounding.report import provenance, results_table
 from report import report
 
 
@@ -34,7 +36,24 @@ def two_phase(options: DictConfig) -> dict:
     if options.self_examine.kind != "action":
         train_goal(options)
     examine(options)
-    return evaluate(options)
+    results = evaluate(options)
+    write_result(options, results)
+    return results
+
+
+def write_result(options: DictConfig, results: dict) -> None:
+    """Write one small file that says what was measured, by which command, where and how long."""
+    run = open_run(options)
+    stages = [run.record(path.stem) for path in (run / "stages").glob("*.json")]
+    given = [text for text in sys.argv[1:] if "=" in text]
+    content = {
+        "command": " ".join(["ifo-grounding", "demo", *given]),
+        "options": plain(options),
+        "seconds": round(sum(record["seconds"] for record in stages), 1),
+        "provenance": provenance(),
+        "results": results,
+    }
+    write_json(run / "result.json", content)
 
 
 @recipe_main

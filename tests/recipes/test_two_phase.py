@@ -76,6 +76,10 @@ def test_a_stage_without_what_it_needs_says_what_to_run(compose):
 
     with pytest.raises(UserError, match="run the recipe record_demonstrations"):
         imitate(compose("imitate"))
+    from evaluate import evaluate
+
+    with pytest.raises(UserError, match="run the recipe imitate"):
+        evaluate(compose("evaluate"))
 
 
 def test_every_recipe_has_options_that_begin_with_its_command(recipes):

@@ -18,6 +18,7 @@ from ifo_grounding.report.plots import (
     success_over_iterations,
     training_curves,
 )
+from ifo_grounding.report.provenance import provenance
 from ifo_grounding.report.results import results_rows, results_table
 from ifo_grounding.report.tables import format_cell, markdown_table, text_table
 
@@ -33,6 +34,7 @@ __all__ = [
     "instruction_cases",
     "markdown_table",
     "phase_bars",
+    "provenance",
     "read_metrics",
     "results_rows",
     "results_table",

@@ -47,6 +47,10 @@ def _dress(axes: Axes, title: str = "", x: str = "", y: str = "", grid: str = "y
     axes.set_axisbelow(True)
 
 
+SHARES = ("accuracy", "probability", "removed", "share", "stopped", "success", "sampled")
+"""Last words of the names of metrics that are shares, and drawn in percent."""
+
+
 def _percent(axes: Axes, low: float = 0.0) -> None:
     axes.set_ylim(low, 1.02)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -115,7 +119,7 @@ def training_curves(
             steps, smoothed(values, span), color=PALETTE[0], linewidth=1.8, marker=marker, ms=3.5
         )
         axes.xaxis.set_major_locator(MaxNLocator(nbins=5))
-        if all(0.0 <= value <= 1.0 for value in values) and max(values) > 0.1:
+        if chosen[index].rpartition("_")[2] in SHARES and max(values) > 0.1:
             _percent(axes)
     return figure
 
