@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ifo_grounding import keys
 
-STANDARD_ERRORS = 1.0
+STANDARD_ERRORS = 2.0
 """How clearly a policy has to be better than the best one so far."""
 
 
@@ -60,8 +60,8 @@ def _batch_returns(env: EnvBase, policy: nn.Module, max_steps: int) -> Tensor:
 class BestPolicy:
     """Remembers the weights with the highest learned return on the same starts.
 
-    A policy takes the place of the best one if its mean return is higher by more than one standard
-    error of the paired difference, so that noise alone seldom replaces what phase 1 has learned.
+    A policy takes the place of the best one if its mean return is higher by more than two standard
+    errors of the paired difference, so that noise alone seldom replaces what phase 1 has learned.
 
     >>> layer = nn.Linear(1, 1, bias=False)
     >>> best = BestPolicy(layer)
