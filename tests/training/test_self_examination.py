@@ -10,7 +10,7 @@ from ifo_grounding.networks import make_policy, make_reward_model, make_value
 from ifo_grounding.objectives import RewardLoss
 from ifo_grounding.tasks import grammar
 from ifo_grounding.training import Adversary, SelfExaminationConfig, select_pairs, self_examine
-from ifo_grounding.training.self_examination import summary
+from ifo_grounding.training.environment import summary
 from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
 
 SMALL = {"n_blocks": 1, "features": 16, "seed": 0}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,6 +14,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ifo_grounding import keys
+from ifo_grounding.seeding import derive
+from ifo_grounding.training.environment import reseed, sampler_stats, transforms_of
+from ifo_grounding.training.supervised import Metrics
 
 STANDARD_ERRORS = 2.0
 """How clearly a policy has to be better than the best one so far."""
@@ -99,3 +103,50 @@ class BestPolicy:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self.weights, self.returns = state["weights"], state["returns"]
+
+
+@dataclass(frozen=True)
+class SelectionSchedule:
+    """When to look at the policy, and for how long."""
+
+    every: int
+    """Iterations between two looks; 0 never looks."""
+    iterations: int
+    """Iterations of the run: the last one is always looked at."""
+    episodes: int
+    """Episodes of each look."""
+    max_steps: int
+    """Most actions of an episode."""
+
+
+class Selection:
+    """Looks at the policy's learned return from time to time, always from the same starts."""
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: nn.Module,
+        schedule: SelectionSchedule,
+        seed: int,
+    ) -> None:
+        self.env, self.policy, self.schedule, self.seed = env, policy, schedule, seed
+        self.best = BestPolicy(policy)
+        self.fixed = [t for t in transforms_of(env) if getattr(t, "fixes_scenes", False)]
+        self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
+
+    def look(self, done: int) -> Metrics:
+        """Measure and consider the policy after some iterations, if it is time to."""
+        schedule = self.schedule
+        last = done == schedule.iterations
+        if not schedule.every or (done % schedule.every and not last):
+            return {}
+        present = copy.deepcopy([starts.state_dict() for starts in self.fixed])
+        for starts, first in zip(self.fixed, self.first_starts, strict=True):
+            starts.load_state_dict(copy.deepcopy(first))
+        reseed(self.env, derive(self.seed, "self-examination", "selection"))
+        returns = learned_returns(self.env, self.policy, schedule.episodes, schedule.max_steps)
+        sampler_stats(self.env)
+        for starts, state in zip(self.fixed, present, strict=True):
+            starts.load_state_dict(state)
+        kept = self.best.consider(returns)
+        return {"selection_return": float(returns.mean()), "selected": float(kept)}

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
@@ -22,7 +22,14 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
-from ifo_grounding.training.selection import BestPolicy, learned_returns
+from ifo_grounding.training.environment import (
+    check_env,
+    reseed,
+    sampler_stats,
+    summary,
+    transforms_of,
+)
+from ifo_grounding.training.selection import Selection, SelectionSchedule
 from ifo_grounding.training.supervised import Callback, Log, Metrics, make_optimizer, update
 
 ALGORITHMS = ("ppo", "reinforce")
@@ -123,7 +130,10 @@ def self_examine(
     value.eval()
     learner = _Learner(env, policy, value, config)
     sampler_stats(env)  # forgets the reset that a collector begins with
-    selection = _Selection(env, policy, config, seed)
+    schedule = SelectionSchedule(
+        config.select_every, config.iterations, config.select_episodes, config.max_steps
+    )
+    selection = Selection(env, policy, schedule, seed)
     parts: dict[str, Any] = {
         "loss": learner.loss,
         "optimizer": learner.optimizer,
@@ -133,7 +143,7 @@ def self_examine(
         parts["adversary"] = adversary
     parts |= {
         f"starts {place}": transform
-        for place, transform in enumerate(_transforms(env))
+        for place, transform in enumerate(transforms_of(env))
         if getattr(transform, "fixes_scenes", False)
     }
     identity = fingerprint(config, seed, list(env.batch_size), settings)
@@ -176,86 +186,6 @@ def self_examine(
             bar.update()
     learner.close()
     return history
-
-
-def check_env(env: EnvBase) -> None:
-    """Refuse an env that shows the true state or pays no learned reward."""
-    base = getattr(env, "base_env", env)
-    if getattr(base, "expose_state", False):
-        raise UserError("self-examination never sees the true state: use expose_state=False")
-    observed = env.observation_spec.keys(True, True)
-    if keys.INSTRUCTION not in observed:
-        raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
-    written = [*env.full_reward_spec.keys(True, True), *observed]
-    if keys.LEARNED_REWARD not in written:
-        raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
-
-
-def reseed(env: EnvBase, seed: int) -> None:
-    """Seed torch, the simulator and every transform that draws; fixed starts keep their scenes."""
-    torch.manual_seed(seed)
-    transforms = _transforms(env)
-    for place, transform in enumerate(transforms):
-        if callable(set_seed := getattr(transform, "set_seed", None)):
-            set_seed(derive(seed, "transform", place) % 2**31)
-    if not any(getattr(transform, "fixes_scenes", False) for transform in transforms):
-        env.set_seed(derive(seed, "simulator") % 2**31)
-
-
-def sampler_stats(env: EnvBase) -> Metrics:
-    """Return what the transforms counted since the last call."""
-    found: Metrics = {}
-    for transform in _transforms(env):
-        if callable(stats := getattr(transform, "stats", None)):
-            found |= {key: float(value) for key, value in stats().items()}
-    return found
-
-
-def summary(batch: TensorDictBase) -> Metrics:
-    """Describe collected steps [N, T] by what the learner can see."""
-    done = batch[keys.NEXT, "done"]
-    stopped = batch[keys.NEXT, "terminated"]
-    reward = batch[keys.NEXT, keys.LEARNED_REWARD]
-    episodes = done.sum().clamp(min=1)
-    return {
-        "frames": float(batch.numel()),
-        "learned_reward": float(reward.mean()),
-        "learned_return": float(reward.sum() / episodes),
-        "episode_length": float(batch.numel() / episodes),
-        "stopped": float(stopped.sum() / episodes),
-    }
-
-
-class _Selection:
-    """Looks at the policy's learned return from time to time, always from the same starts."""
-
-    def __init__(
-        self,
-        env: EnvBase,
-        policy: ProbabilisticTensorDictSequential,
-        config: SelfExaminationConfig,
-        seed: int,
-    ) -> None:
-        self.env, self.policy, self.config, self.seed = env, policy, config, seed
-        self.best = BestPolicy(policy)
-        self.fixed = [t for t in _transforms(env) if getattr(t, "fixes_scenes", False)]
-        self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
-
-    def look(self, done: int) -> Metrics:
-        """Measure and consider the policy after some iterations, if it is time to."""
-        config = self.config
-        if not config.select_every or (done % config.select_every and done != config.iterations):
-            return {}
-        present = copy.deepcopy([starts.state_dict() for starts in self.fixed])
-        for starts, first in zip(self.fixed, self.first_starts, strict=True):
-            starts.load_state_dict(copy.deepcopy(first))
-        reseed(self.env, derive(self.seed, NAME, "selection"))
-        returns = learned_returns(self.env, self.policy, config.select_episodes, config.max_steps)
-        sampler_stats(self.env)
-        for starts, last in zip(self.fixed, present, strict=True):
-            starts.load_state_dict(last)
-        kept = self.best.consider(returns)
-        return {"selection_return": float(returns.mean()), "selected": float(kept)}
 
 
 class _Learner:
@@ -358,10 +288,3 @@ def _make_loss(
 
 def _log_prob(policy: ProbabilisticTensorDictSequential, steps: TensorDictBase) -> Tensor:
     return policy.get_dist(steps.copy()).log_prob(steps[keys.ACTION])
-
-
-def _transforms(env: EnvBase) -> list[nn.Module]:
-    transform = getattr(env, "transform", None)
-    if transform is None:
-        return []
-    return list(transform) if hasattr(transform, "transforms") else [transform]

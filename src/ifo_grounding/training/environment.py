@@ -1,0 +1,69 @@
+"""What self-examination asks of an environment: that it leaks nothing, and can be repeated."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import derive
+from ifo_grounding.training.supervised import Metrics
+
+
+def check_env(env: EnvBase) -> None:
+    """Refuse an env that shows the true state or pays no learned reward."""
+    base = getattr(env, "base_env", env)
+    if getattr(base, "expose_state", False):
+        raise UserError("self-examination never sees the true state: use expose_state=False")
+    observed = env.observation_spec.keys(True, True)
+    if keys.INSTRUCTION not in observed:
+        raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
+    written = [*env.full_reward_spec.keys(True, True), *observed]
+    if keys.LEARNED_REWARD not in written:
+        raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
+
+
+def reseed(env: EnvBase, seed: int) -> None:
+    """Seed torch, the simulator and every transform that draws; fixed starts keep their scenes."""
+    torch.manual_seed(seed)
+    transforms = transforms_of(env)
+    for place, transform in enumerate(transforms):
+        if callable(set_seed := getattr(transform, "set_seed", None)):
+            set_seed(derive(seed, "transform", place) % 2**31)
+    if not any(getattr(transform, "fixes_scenes", False) for transform in transforms):
+        env.set_seed(derive(seed, "simulator") % 2**31)
+
+
+def sampler_stats(env: EnvBase) -> Metrics:
+    """Return what the transforms counted since the last call."""
+    found: Metrics = {}
+    for transform in transforms_of(env):
+        if callable(stats := getattr(transform, "stats", None)):
+            found |= {key: float(value) for key, value in stats().items()}
+    return found
+
+
+def transforms_of(env: EnvBase) -> list[nn.Module]:
+    """Return the transforms of an env, in their order."""
+    transform = getattr(env, "transform", None)
+    if transform is None:
+        return []
+    return list(transform) if hasattr(transform, "transforms") else [transform]
+
+
+def summary(batch: TensorDictBase) -> Metrics:
+    """Describe collected steps [N, T] by what the learner can see."""
+    done = batch[keys.NEXT, "done"]
+    stopped = batch[keys.NEXT, "terminated"]
+    reward = batch[keys.NEXT, keys.LEARNED_REWARD]
+    episodes = done.sum().clamp(min=1)
+    return {
+        "frames": float(batch.numel()),
+        "learned_reward": float(reward.mean()),
+        "learned_return": float(reward.sum() / episodes),
+        "episode_length": float(batch.numel() / episodes),
+        "stopped": float(stopped.sum() / episodes),
+    }
