@@ -1,0 +1,98 @@
+"""Write the tables of results: ``python docs/make_results.py`` after ``results/`` has changed.
+
+Reads ``results/*.json`` (the ``result.json`` of runs) and writes ``docs/results.md`` and the part
+of ``README.md`` between its two marks. A test checks that both are up to date.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from ifo_grounding.files import atomic_write, read_json
+from ifo_grounding.report import markdown_table, results_rows
+from ifo_grounding.report.results import restored
+from ifo_grounding.stats import Difference, Rate
+from ifo_grounding.tasks import TASKS
+
+ROOT = Path(__file__).parents[1]
+MARKS = ("<!-- results -->", "<!-- /results -->")
+
+
+def runs() -> list[dict[str, Any]]:
+    """Return all committed results, in the order of the tasks."""
+    found = [read_json(path) for path in sorted((ROOT / "results").glob("*.json"))]
+    return sorted(found, key=lambda result: TASKS.index(result["options"]["task"]))
+
+
+def overview(found: list[dict[str, Any]]) -> str:
+    """Return a table with one row per run."""
+    rows = []
+    for run in found:
+        results, options = run["results"], run["options"]
+        rows.append(
+            {
+                "task": options["task"],
+                "demonstrations": options["demonstrations"]["n"],
+                "phase 1": short(results["phase1"]["rate"]),
+                "phase 2": short(results["phase2"]["rate"]),
+                "gain, points": short_gain(results["gain"]),
+                "suitable rate": short(results["suitability"]["rate"]),
+            }
+        )
+    return markdown_table(rows)
+
+
+def short(rate: dict[str, Any]) -> str:
+    return str(restored(Rate, rate)).rpartition(" (")[0]
+
+
+def short_gain(gain: dict[str, Any]) -> str:
+    return str(restored(Difference, gain)).rpartition(" (")[0].replace(" points", "")
+
+
+def page(found: list[dict[str, Any]]) -> str:
+    """Return the page of results."""
+    parts = [
+        "# Results",
+        "Every number here comes from a file under `results/`, which holds all options, the seed,"
+        " the commit and the machine. `python docs/make_results.py` writes this page from them.",
+        "## Both phases on few demonstrations",
+        "Preset `strong`, budget `demo`, one seed; success of the greedy policy on 2,000 evaluation"
+        " scenes, with Wilson's 95% interval; the gain is paired by scene. One seed is a lead, not"
+        " a result over seeds.",
+        overview(found),
+    ]
+    for run in found:
+        made = run["provenance"]
+        parts += [
+            f"## {run['options']['task']}",
+            f"`{run['command']}`, seed {run['options']['seed']}, commit `{made['commit']}`, "
+            f"{made['machine']} ({made['cores']} cores, {made['threads']} threads), torch "
+            f"{made['torch']}, {run['seconds'] / 60:.1f} minutes, scenes "
+            f"`{run['results']['phase1']['scenes'][:16]}`.",
+            markdown_table(results_rows(run["results"])),
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def readme(found: list[dict[str, Any]], text: str) -> str:
+    """Return the README with its table of results renewed."""
+    before, _, rest = text.partition(MARKS[0])
+    _, _, after = rest.partition(MARKS[1])
+    return f"{before}{MARKS[0]}\n{overview(found)}\n{MARKS[1]}{after}"
+
+
+def written() -> dict[Path, str]:
+    """Return what each file should say."""
+    found = runs()
+    path = ROOT / "README.md"
+    return {ROOT / "docs" / "results.md": page(found), path: readme(found, path.read_text())}
+
+
+def main() -> None:
+    for path, text in written().items():
+        with atomic_write(path) as temporary:
+            temporary.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
