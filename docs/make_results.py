@@ -60,13 +60,19 @@ def page(found: list[dict[str, Any]]) -> str:
         " scenes, with Wilson's 95% interval; the gain is paired by scene. One seed is a lead, not"
         " a result over seeds.",
         overview(found),
+        "A gain of exactly 0 means that no policy of phase 2 had a clearly higher learned return, so"
+        " that phase 1's was kept. At this budget phase 2 does not improve the policy: the greedy"
+        " policy already earns most of what the goal judge pays, and the limit is the instruction"
+        " module. With `pick-out`, 3 in 1,000 random pairs are suitable, and random negatives are too"
+        " easy to teach it so fine a choice: most chosen instructions name an object that is not in"
+        " the box.",
     ]
     for run in found:
         made = run["provenance"]
         parts += [
             f"## {run['options']['task']}",
             f"`{run['command']}`, seed {run['options']['seed']}, commit `{made['commit']}`, "
-            f"{made['machine']} ({made['cores']} cores, {made['threads']} threads), torch "
+            f"{made['machine']} ({made['cores']} cores, torch threads: {made['threads']}), torch "
             f"{made['torch']}, {run['seconds'] / 60:.1f} minutes, scenes "
             f"`{run['results']['phase1']['scenes'][:16]}`.",
             markdown_table(results_rows(run["results"])),
