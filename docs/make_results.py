@@ -60,12 +60,11 @@ def page(found: list[dict[str, Any]]) -> str:
         " scenes, with Wilson's 95% interval; the gain is paired by scene. One seed is a lead, not"
         " a result over seeds.",
         overview(found),
-        "A gain of exactly 0 means that no policy of phase 2 had a clearly higher learned return, so"
-        " that phase 1's was kept. At this budget phase 2 does not improve the policy: the greedy"
-        " policy already earns most of what the goal judge pays, and the limit is the instruction"
-        " module. With `pick-out`, 3 in 1,000 random pairs are suitable, and random negatives are too"
-        " easy to teach it so fine a choice: most chosen instructions name an object that is not in"
-        " the box.",
+        "A gain of exactly 0 means that no policy of phase 2 had a clearly higher learned return,"
+        " so that phase 1's was kept. At this budget, some 60,000 steps of practice, phase 2 does"
+        " not improve the policy. With `pick-out` the instruction module is the limit: 3 in 1,000"
+        " random pairs are suitable, random negatives are too easy to teach so fine a choice, and"
+        " most chosen instructions name an object that is not in the box.",
     ]
     for run in found:
         made = run["provenance"]
