@@ -18,6 +18,7 @@ from ifo_grounding.data.buffers import FINAL, frame_buffer
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import fact, load_folder, save_folder
 from ifo_grounding.errors import UserError
+from ifo_grounding.modules import device_of, evaluating
 
 KIND = "ifo-grounding labels"
 VERSION = 1
@@ -128,23 +129,17 @@ def label_demonstrations(
         raise UserError("there is nothing to label: no episode has two frames")
     if batch_size < 1:
         raise UserError(f"batch_size must be at least 1, got {batch_size}")
-    device = torch.device(device) if device is not None else _device(inverse)
+    device = torch.device(device or device_of(inverse) or "cpu")
     frame = demos.locate()[1]
-    modes = {module: module.training for module in inverse.modules()}
-    inverse.eval()
     labels, sure, n_actions = [], [], 0
-    try:
-        with torch.no_grad(), tqdm(total=len(frame), desc="label", disable=not progress) as bar:
-            for numbers in frame.split(batch_size):
-                logits = _logits(demos, inverse, numbers, device, logits_key)
-                n_actions = logits.shape[-1]
-                best = logits.float().softmax(-1).max(-1)
-                labels.append(best.indices.to("cpu", torch.uint8))
-                sure.append(best.values.cpu())
-                bar.update(len(numbers))
-    finally:
-        for module, mode in modes.items():
-            module.training = mode
+    with evaluating(inverse), tqdm(total=len(frame), desc="label", disable=not progress) as bar:
+        for numbers in frame.split(batch_size):
+            logits = _logits(demos, inverse, numbers, device, logits_key)
+            n_actions = logits.shape[-1]
+            best = logits.float().softmax(-1).max(-1)
+            labels.append(best.indices.to("cpu", torch.uint8))
+            sure.append(best.values.cpu())
+            bar.update(len(numbers))
     report = LabelReport(torch.cat(labels), torch.cat(sure), n_actions)
     return Labelled(labelled_buffer(demos, report.actions, **buffer_options), report)
 
@@ -223,10 +218,3 @@ def _logits(
         found = "nothing" if logits is None else list(logits.shape)
         raise UserError(f"the inverse model wrote {found} at {logits_key!r}, not logits [B, A]")
     return logits
-
-
-def _device(module: torch.nn.Module) -> torch.device:
-    """Return where a module's first parameter or buffer is."""
-    for tensor in (*module.parameters(), *module.buffers()):
-        return tensor.device
-    return torch.device("cpu")

@@ -3,7 +3,6 @@
 Evaluation reads the truth (scenes, goals, rewards); learners never import it.
 """
 
-from ifo_grounding.evaluation.episodes import evaluating
 from ifo_grounding.evaluation.labels import LabelAccuracy, label_accuracy
 from ifo_grounding.evaluation.recording import Episode, record_episodes
 from ifo_grounding.evaluation.reward import (
@@ -18,6 +17,7 @@ from ifo_grounding.evaluation.suitability import (
     judged_choices,
     suitable_rate,
 )
+from ifo_grounding.modules import evaluating
 from ifo_grounding.stats import (
     Difference,
     Estimate,

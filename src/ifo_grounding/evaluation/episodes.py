@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
-from ifo_grounding import keys
+from ifo_grounding import keys, modules
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import derive
@@ -39,37 +39,9 @@ class Outcomes(NamedTuple):
     """Whether the policy stopped by itself, bool [N]."""
 
 
-@contextlib.contextmanager
-def evaluating(*modules: object) -> Iterator[None]:
-    """Run a block without gradients and in eval mode; every submodule gets its own mode back.
-
-    What is no ``nn.Module`` is left alone.
-
-    >>> network = nn.Sequential(nn.Dropout(), nn.Linear(1, 1).eval())
-    >>> with evaluating(network):
-    ...     print([part.training for part in network])
-    [False, False]
-    >>> [part.training for part in network]
-    [True, False]
-    """
-    parts = [part for m in modules if isinstance(m, nn.Module) for part in m.modules()]
-    in_training = [part for part in parts if part.training]
-    try:
-        for part in in_training:
-            part.training = False
-        with torch.no_grad():
-            yield
-    finally:
-        for part in in_training:
-            part.training = True
-
-
 def device_of(module: object) -> torch.device:
     """Return the device of a module's first parameter or buffer, else the CPU."""
-    if isinstance(module, nn.Module):
-        for tensor in (*module.parameters(), *module.buffers()):
-            return tensor.device
-    return torch.device("cpu")
+    return modules.device_of(module) or torch.device("cpu")
 
 
 @contextlib.contextmanager

@@ -17,11 +17,11 @@ from ifo_grounding.evaluation.episodes import (
     MAX_STEPS,
     Policy,
     device_of,
-    evaluating,
     play,
     scene_batches,
     seeded,
 )
+from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 

@@ -18,12 +18,12 @@ from ifo_grounding.evaluation.episodes import (
     MAX_STEPS,
     Policy,
     device_of,
-    evaluating,
     play,
     scene_batches,
     seeded,
 )
 from ifo_grounding.evaluation.labels import actions_of
+from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.stats import Estimate, Rate, auc, correlation, wilson
 from ifo_grounding.transforms import LearnedReward

@@ -19,11 +19,11 @@ from ifo_grounding.evaluation.episodes import (
     Policy,
     SceneHash,
     device_of,
-    evaluating,
     play,
     scene_batches,
     seeded,
 )
+from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive
 from ifo_grounding.stats import Difference, Rate, paired_difference, wilson
 

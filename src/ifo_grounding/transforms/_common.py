@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
-
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
@@ -134,27 +131,6 @@ def base_of(transform: Transform) -> EnvBase | None:
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
-
-
-@contextlib.contextmanager
-def judging(module: nn.Module) -> Iterator[None]:
-    """Run a block without gradients and with ``module`` in eval mode; restore every mode after."""
-    training = [part for part in module.modules() if part.training]
-    try:
-        if training:
-            module.eval()
-        with torch.no_grad():
-            yield
-    finally:
-        for part in training:
-            part.training = True
-
-
-def device_of(module: nn.Module) -> torch.device | None:
-    """Device of the first parameter or buffer, None where there is none."""
-    for tensor in (*module.parameters(), *module.buffers()):
-        return tensor.device
-    return None
 
 
 def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.keys import PIXELS, SUITABILITY
-from ifo_grounding.transforms._common import device_of, flat_logit, judging, logit_key
+from ifo_grounding.modules import device_of, evaluating
+from ifo_grounding.transforms._common import flat_logit, logit_key
 
 CHOICES = ("random", "best")
 AT_ONCE = 2048
@@ -87,7 +88,7 @@ class PoolScorer:
         if (network := self.network) is None:
             return pixels
         device = device_of(self.classifier) or pixels.device
-        with judging(self.classifier):
+        with evaluating(self.classifier):
             return torch.cat([network.encode_pixels(p.to(device)) for p in pixels.split(AT_ONCE)])
 
     def score(self, states: Tensor, index: Tensor) -> Tensor:
@@ -103,7 +104,7 @@ class PoolScorer:
         self.scored += index.numel()
         device = device_of(self.classifier) or states.device
         rows = max(1, AT_ONCE // max(1, index.shape[1]))
-        with judging(self.classifier):
+        with evaluating(self.classifier):
             parts = [
                 self._pairs(some.to(device), candidates.to(device))
                 for some, candidates in zip(states.split(rows), index.split(rows), strict=True)

@@ -22,11 +22,10 @@ from ifo_grounding.keys import (
     PIXELS,
     STOP,
 )
+from ifo_grounding.modules import device_of, evaluating
 from ifo_grounding.transforms._common import (
     EpisodeTransform,
-    device_of,
     flat_logit,
-    judging,
     logit_key,
 )
 
@@ -205,7 +204,7 @@ class LearnedReward(EpisodeTransform):
         batch = TensorDict({}, batch_size=[rows])
         for key, value in entries.items():
             batch.set(key, value)
-        with judging(judge):
+        with evaluating(judge):
             parts = [
                 flat_logit(judge(part.to(device)).get(name), len(part), name)
                 for part in batch.split(ROWS_AT_ONCE)

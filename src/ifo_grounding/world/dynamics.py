@@ -8,7 +8,6 @@ from torch import Tensor
 from ifo_grounding.world.state import WorldState
 
 UP, RIGHT, DOWN, LEFT, PICK_PLACE, STOP = range(6)
-N_ACTIONS = 6
 
 
 def neighbour(cell: Tensor, direction: Tensor, size: int) -> tuple[Tensor, Tensor]:

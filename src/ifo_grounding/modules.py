@@ -1,0 +1,46 @@
+"""What every part does with modules that it is handed: find their device, run them in eval mode."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+from torch import nn
+
+
+@contextlib.contextmanager
+def evaluating(*modules: object) -> Iterator[None]:
+    """Run a block without gradients and in eval mode; every submodule gets its own mode back.
+
+    What is no ``nn.Module`` is left alone.
+
+    >>> network = nn.Sequential(nn.Dropout(), nn.Linear(1, 1).eval())
+    >>> with evaluating(network):
+    ...     print([part.training for part in network])
+    [False, False]
+    >>> [part.training for part in network]
+    [True, False]
+    """
+    parts = [part for m in modules if isinstance(m, nn.Module) for part in m.modules()]
+    in_training = [part for part in parts if part.training]
+    try:
+        for part in in_training:
+            part.training = False
+        with torch.no_grad():
+            yield
+    finally:
+        for part in in_training:
+            part.training = True
+
+
+def device_of(module: object) -> torch.device | None:
+    """Return the device of a module's first parameter or buffer, None where there is none.
+
+    >>> device_of(nn.Linear(1, 1)), device_of(nn.ReLU())
+    (device(type='cpu'), None)
+    """
+    if isinstance(module, nn.Module):
+        for tensor in (*module.parameters(), *module.buffers()):
+            return tensor.device
+    return None
