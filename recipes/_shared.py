@@ -15,7 +15,7 @@ from torchrl.data import ReplayBuffer
 from ifo_grounding import networks
 from ifo_grounding.data import Demonstrations, LabelReport
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
+from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.world import Layout
 
@@ -27,6 +27,7 @@ TRUTH = "truth"
 LABELS = "labels"
 INVERSE = "inverse.safetensors"
 POLICIES = ("policy-phase1.safetensors", "policy-phase2.safetensors")
+CONTROLS = ("policy-continued.safetensors", "policy-cloned.safetensors")
 CLASSIFIER = "instruction.safetensors"
 REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
@@ -105,8 +106,10 @@ def train(
     buffer: ReplayBuffer,
     section: str,
     file: str,
+    held_out: HeldOut | None = None,
+    finish: Callable[[], Any] | None = None,
 ) -> dict:
-    """Fit a network to a buffer, save it, and finish the stage."""
+    """Fit a network to a buffer, do what is left to do, save it, and finish the stage."""
     history = fit(
         loss,
         buffer,
@@ -116,9 +119,12 @@ def train(
         checkpoint=stage.checkpoint,
         checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
+        held_out=held_out,
         progress=shows_progress(options),
         settings=stage.settings,
     )
+    if finish is not None:
+        finish()
     networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
     return stage.finish(history[-1], history)
 

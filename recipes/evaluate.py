@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 from _shared import (
     CLASSIFIER,
+    CONTROLS,
     GOAL,
     POLICIES,
     REWARD,
@@ -14,6 +16,7 @@ from _shared import (
     world,
 )
 from omegaconf import DictConfig
+from torch import Tensor
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import record_demonstrations
@@ -28,6 +31,8 @@ from ifo_grounding.report import results_table
 from ifo_grounding.training import Run
 from ifo_grounding.transforms import LearnedReward
 
+NAMES = dict(zip(("phase1", "phase2", "continued", "cloned"), (*POLICIES, *CONTROLS), strict=True))
+"""Policies that a run may have, by their names in the results."""
 HELD_OUT = 500
 """Demonstrations, none of them trained on, that the action reward is compared with."""
 
@@ -51,8 +56,8 @@ def evaluate(options: DictConfig) -> dict:
 def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
     """Measure success of the policy of each phase on the same fixed scenes, and the difference."""
     section = options.evaluate
-    measured = [
-        success_rate(
+    measured = {
+        name: success_rate(
             load_network(run, file, "imitate", options),
             options.task,
             mode=section.mode,
@@ -61,15 +66,23 @@ def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
             stream=section.stream,
             **evaluation_world(options),
         )
-        for file in POLICIES
+        for name, file in NAMES.items()
         if (run / file).exists()
-    ]
-    results = {f"phase{place}": success.as_dict() for place, success in enumerate(measured, 1)}
-    outcomes = torch.stack([success.outcomes for success in measured])
-    torch.save(outcomes, run / "outcomes.pt")
-    if len(measured) == 2:
-        results["gain"] = compare_success(*measured).as_dict()
+    }
+    results = {
+        name: {**success.as_dict(), "outcomes": packed(success.outcomes)}
+        for name, success in measured.items()
+    }
+    phases = [measured[name].outcomes for name in ("phase1", "phase2") if name in measured]
+    torch.save(torch.stack(phases), run / "outcomes.pt")
+    if "phase2" in measured:
+        results["gain"] = compare_success(measured["phase1"], measured["phase2"]).as_dict()
     return results
+
+
+def packed(outcomes: Tensor) -> str:
+    """Return the success of each scene as hexadecimal digits, four scenes each."""
+    return np.packbits(outcomes.numpy()).tobytes().hex()
 
 
 def evaluate_choices(run: Run, options: DictConfig) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from _shared import (
     load_labels,
     load_network,
     open_stage,
-    plain,
     self_examination_config,
     shows_progress,
     simulator,
@@ -42,7 +41,7 @@ def examine(options: DictConfig) -> dict:
         return stage.result
     run = stage.run
     policy = load_network(run, POLICIES[0], "imitate", options)
-    value = build(networks.make_value, options, **plain(section.critic))
+    value = build(networks.make_value, options, init_from=policy)
     reward, adversary = learned_reward(run, options)
     env = TransformedEnv(
         simulator(options, section.num_envs), Compose(chosen_starts(run, options), reward)

@@ -34,7 +34,9 @@ def train_instruction(options: DictConfig) -> dict:
         removal_rate=options.instruction.removal_rate,
         warmup=options.instruction.removal_warmup,
     )
-    return train(options, stage, loss, first_frame_buffer(demos), "instruction", CLASSIFIER)
+    calibrate = loss.calibrate if options.instruction.removal_rate == "estimated" else None
+    buffer = first_frame_buffer(demos)
+    return train(options, stage, loss, buffer, "instruction", CLASSIFIER, finish=calibrate)
 
 
 @recipe_main

@@ -22,6 +22,13 @@ from report import report
 
 
 def two_phase(options: DictConfig) -> dict:
+    train_phases(options)
+    results = evaluate(options)
+    write_result(options, results, "demo")
+    return results
+
+
+def train_phases(options: DictConfig) -> None:
     write_json(open_run(options) / "options.json", plain(options))
     # Phase 1: imitation from observation.
     collect(options)
@@ -36,24 +43,23 @@ def two_phase(options: DictConfig) -> dict:
     if options.self_examine.kind != "action":
         train_goal(options)
     examine(options)
-    results = evaluate(options)
-    write_result(options, results)
-    return results
 
 
-def write_result(options: DictConfig, results: dict) -> None:
+def write_result(options: DictConfig, results: dict, command: str) -> dict:
     """Write one small file that says what was measured, by which command, where and how long."""
     run = open_run(options)
-    stages = [run.record(path.stem) for path in (run / "stages").glob("*.json")]
+    stages = {p.stem: run.record(p.stem)["seconds"] for p in (run / "stages").glob("*.json")}
     given = [text for text in sys.argv[1:] if "=" in text]
     content = {
-        "command": " ".join(["ifo-grounding", "demo", *given]),
+        "command": " ".join(["ifo-grounding", command, *given]),
         "options": plain(options),
-        "seconds": round(sum(record["seconds"] for record in stages), 1),
+        "seconds": round(sum(stages.values()), 1),
+        "stages": stages,
         "provenance": provenance(),
         "results": results,
     }
     write_json(run / "result.json", content)
+    return content
 
 
 @recipe_main

@@ -1,7 +1,15 @@
+import pytest
 import torch
 from torch import nn
 
-from ifo_grounding.networks import GatedAttention, ResidualBlock, ResidualFiLM, pool_cells
+from ifo_grounding.networks import (
+    CellLinear,
+    GatedAttention,
+    ResidualBlock,
+    ResidualFiLM,
+    SpatialReadout,
+    pool_cells,
+)
 
 
 def test_gated_attention_is_the_papers_equation():
@@ -16,7 +24,7 @@ def test_gated_attention_is_the_papers_equation():
 
 
 def test_film_block_by_hand():
-    block = ResidualFiLM(1, 1)
+    block = ResidualFiLM(1, 1, kernel=3)
     with torch.no_grad():
         block.mix.weight.fill_(2)
         block.mix.bias.fill_(1)
@@ -33,7 +41,7 @@ def test_film_block_by_hand():
 
 def test_an_instruction_of_zeros_leaves_the_plain_block():
     torch.manual_seed(0)
-    film, plain = ResidualFiLM(4, 8), ResidualBlock(8)
+    film, plain = ResidualFiLM(4, 8, kernel=3), ResidualBlock(8)
     nn.init.zeros_(film.film.bias)
     plain.load_state_dict({k: v for k, v in film.state_dict().items() if "film" not in k})
     image = torch.randn(2, 8, 6, 6)
@@ -43,3 +51,45 @@ def test_an_instruction_of_zeros_leaves_the_plain_block():
 def test_pooling_keeps_maxima_and_means():
     image = torch.tensor([[[[1.0, 2.0], [3.0, 6.0]], [[-1.0, -1.0], [-1.0, -5.0]]]])
     assert pool_cells(image).tolist() == [[6.0, -1.0, 3.0, -2.0]]
+
+
+def test_a_linear_layer_of_cells_is_a_1x1_convolution():
+    torch.manual_seed(0)
+    layer = CellLinear(5, 7)
+    image = torch.randn(2, 5, 3, 4)
+    expected = nn.functional.conv2d(image, layer.weight[..., None, None], layer.bias)
+    torch.testing.assert_close(layer(image), expected)
+
+
+@pytest.mark.parametrize(("kernel", "reach"), [(1, 1), (3, 9)])
+def test_a_block_sees_as_far_as_its_kernel(kernel, reach):
+    torch.manual_seed(0)
+    block = ResidualFiLM(4, 8, kernel=kernel)
+    image = torch.randn(1, 8, 6, 6)
+    changed = image.clone()
+    changed[..., 2, 3] += 1
+    words = torch.randn(1, 4)
+    different = (block(image, words) - block(changed, words)).abs().amax(1) > 1e-6
+    assert int(different.sum()) == reach
+
+
+def test_a_readout_tells_where_a_head_looks_and_what_it_sees():
+    readout = SpatialReadout(2, heads=1, values=1, grid=(3, 5))
+    with torch.no_grad():
+        readout.attention.weight.copy_(torch.tensor([[100.0, 0.0]]))
+        readout.attention.bias.zero_()
+        readout.value.weight.copy_(torch.tensor([[0.0, 1.0]]))
+        readout.value.bias.fill_(0.5)
+    image = torch.zeros(1, 2, 3, 5)
+    image[0, 0, 2, 1] = 1
+    image[0, 1] = torch.arange(15.0).reshape(3, 5)
+    # the head looks at row 2 of 0..2 and column 1 of 0..4, whose second channel holds 11
+    torch.testing.assert_close(readout(image), torch.tensor([[1.0, -0.5, 11.5]]))
+    assert readout.maps(image).argmax() == 11
+    torch.testing.assert_close(readout.maps(image).sum((-2, -1)), torch.ones(1, 1))
+
+
+def test_a_readout_of_one_row_of_cells_is_finite():
+    readout = SpatialReadout(2, heads=3, values=4, grid=(1, 4))
+    assert readout(torch.randn(2, 2, 1, 4)).isfinite().all()
+    assert readout.size == 3 * 6

@@ -144,7 +144,7 @@ def test_presets_are_what_the_design_says():
     assert (paper.conv_layers, paper.features, paper.hidden, paper.embedding) == (4, 32, 64, 8)
     assert paper.dropout == 0.25
     strong = NetworkConfig.of("policy", "strong")
-    assert (strong.n_blocks, strong.features) == (4, 64)
+    assert (strong.n_blocks, strong.features, strong.heads) == (2, 64, 8)
 
 
 def test_bf16_stays_near_fp32(kind, preset, shapes):

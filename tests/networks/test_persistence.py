@@ -107,7 +107,7 @@ CHANGES = {
     "a missing weight": lambda content, weights: weights.popitem(),
     "a missing part": lambda content, weights: content.pop("shapes"),
     "no table": lambda content, weights: content.update(options=3),
-    "another shape": lambda content, weights: content["shapes"].update(image_shape=[3, 64, 64]),
+    "another shape": lambda content, weights: content["shapes"].update(image_shape=[1, 48, 48]),
 }
 
 

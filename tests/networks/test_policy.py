@@ -131,6 +131,7 @@ def test_an_instruction_module_begins_with_what_the_policy_learned(shapes, prese
     )
     assert not torch.equal(classifier.encode_instruction(tokens), fresh.encode_instruction(tokens))
     fusion = classifier.module.fusion.state_dict()
-    assert all(torch.equal(w, fusion[n]) for n, w in trunk.fusion[0].state_dict().items())
+    assert fusion
+    assert all(torch.equal(trunk.fusion.state_dict()[name], w) for name, w in fusion.items())
     with pytest.raises(UserError, match="does not fit"):
         make_instruction_classifier(shapes, preset, init_from=policy, embedding=5)

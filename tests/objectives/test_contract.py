@@ -172,7 +172,7 @@ def test_padding_that_torchrl_marks_does_not_count(kind):
 
 def test_it_learns_a_small_batch_by_heart(kind):
     torch.manual_seed(0)
-    loss = make_loss(kind, make_options={"features": 32, "n_blocks": 1})
+    loss = make_loss(kind, make_options={"features": 32})
     data = batch((12,))
     data["instruction"] = POOL
     if hasattr(loss, "set_progress"):

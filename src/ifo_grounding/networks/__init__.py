@@ -4,11 +4,21 @@ from ifo_grounding.networks.building import Blueprint
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     ConvEncoder,
+    ConvInstructionEncoder,
+    GRUInstructionEncoder,
     InstructionEncoder,
     PatchEncoder,
     distinct_rows,
 )
-from ifo_grounding.networks.fusion import GatedAttention, ResidualBlock, ResidualFiLM, pool_cells
+from ifo_grounding.networks.fusion import (
+    CellCount,
+    CellLinear,
+    GatedAttention,
+    ResidualBlock,
+    ResidualFiLM,
+    SpatialReadout,
+    pool_cells,
+)
 from ifo_grounding.networks.goal import make_goal_judge
 from ifo_grounding.networks.instruction import PairScorer, make_instruction_classifier
 from ifo_grounding.networks.inverse import InverseNetwork, make_inverse
@@ -19,7 +29,11 @@ from ifo_grounding.networks.shapes import Shapes
 
 __all__ = [
     "Blueprint",
+    "CellCount",
+    "CellLinear",
     "ConvEncoder",
+    "ConvInstructionEncoder",
+    "GRUInstructionEncoder",
     "GatedAttention",
     "InstructionEncoder",
     "InverseNetwork",
@@ -31,6 +45,7 @@ __all__ = [
     "ResidualFiLM",
     "RewardNetwork",
     "Shapes",
+    "SpatialReadout",
     "ValueNetwork",
     "distinct_rows",
     "load",

@@ -28,11 +28,23 @@ class NetworkConfig:
     patch_size: int | None
     """Pixels per side of a patch (``strong``); None means the tile size, or 8."""
     n_blocks: int
-    """Residual blocks over the feature map (``strong``)."""
+    """Residual blocks that modulate the feature map by the instruction (``strong``)."""
+    kernel: int
+    """Cells across that a residual block sees: 1 for the cell alone (``strong``)."""
+    context: int
+    """Residual blocks of kernel 3 before the instruction comes in (``strong``)."""
+    heads: int
+    """Attention maps that the head reads (``strong``)."""
+    values: int
+    """Values that each attention map reads (``strong``)."""
+    detectors: int
+    """Kinds of cells that the instruction module and the goal judge count (``strong``)."""
+    words: str
+    """``"gru"`` (the paper's) or ``"conv"``: how a sentence is encoded."""
     embedding: int
     """Size of a word's embedding."""
     hidden: int
-    """Size of the GRU's state, each way."""
+    """Half the size of an encoded sentence: the GRU's state, each way."""
     dropout: float
     """Dropout rate before each linear layer of the head."""
     head_hidden: tuple[int, ...]
@@ -42,6 +54,7 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, PRESETS)
+        check_choice("words", self.words, ("gru", "conv"))
         check_choice("precision", self.precision, ("auto", "fp32", "bf16"))
         for name in ("features", "embedding", "hidden"):
             if getattr(self, name) < 1:
@@ -72,6 +85,12 @@ _PAPER: dict[str, Any] = {
     "conv_layers": 4,
     "patch_size": None,
     "n_blocks": 0,
+    "kernel": 1,
+    "context": 0,
+    "heads": 0,
+    "values": 0,
+    "detectors": 0,
+    "words": "gru",
     "embedding": 8,
     "hidden": 64,
     "dropout": 0.25,
@@ -81,7 +100,13 @@ _STRONG: dict[str, Any] = {
     "features": 64,
     "conv_layers": 0,
     "patch_size": None,
-    "n_blocks": 4,
+    "n_blocks": 2,
+    "kernel": 1,
+    "context": 0,
+    "heads": 8,
+    "values": 16,
+    "detectors": 32,
+    "words": "conv",
     "embedding": 32,
     "hidden": 64,
     "dropout": 0.0,
@@ -91,9 +116,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "paper": {**dict.fromkeys(KINDS, _PAPER), "value": {**_PAPER, "dropout": 0.0}},
     "strong": {
         **dict.fromkeys(KINDS, _STRONG),
-        "inverse": {**_STRONG, "features": 32, "n_blocks": 2},
-        "instruction": {**_STRONG, "n_blocks": 0},
-        "goal": {**_STRONG, "n_blocks": 1},
+        "inverse": {**_STRONG, "features": 32, "n_blocks": 0, "context": 2},
     },
 }
 """Values by preset and kind. A critic has no dropout: its targets would be noise."""

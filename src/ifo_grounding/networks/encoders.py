@@ -50,21 +50,20 @@ class ConvEncoder(nn.Module):
 
 
 class PatchEncoder(nn.Module):
-    """One feature vector per patch, plus a learned vector per place.
+    """One feature vector per patch, the same wherever the patch lies.
 
     A linear layer of rearranged pixels, which trains faster on a CPU than a strided convolution:
     bytes are cheaper to rearrange than floats, and the layout fits the convolutions that follow.
     An image whose sides are not multiples of the patch is padded with black to the right and below.
 
-    >>> PatchEncoder(3, features=64, patch=8, grid=(6, 6))(torch.zeros(2, 3, 48, 48)).shape
+    >>> PatchEncoder(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48)).shape
     torch.Size([2, 64, 6, 6])
     """
 
-    def __init__(self, channels: int, features: int, patch: int, grid: tuple[int, int]) -> None:
+    def __init__(self, channels: int, features: int, patch: int) -> None:
         super().__init__()
         self.patch = patch
         self.embed = nn.Linear(channels * patch**2, features)
-        self.place = nn.Parameter(0.02 * torch.randn(*grid, features))
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w], channels last in memory."""
@@ -73,7 +72,7 @@ class PatchEncoder(nn.Module):
             image = F.pad(image, (0, right, 0, below))
         cells = image.unflatten(-1, (-1, self.patch)).unflatten(-3, (-1, self.patch))
         patches = cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
-        return (self.embed(as_float(patches)) + self.place).permute(0, 3, 1, 2)
+        return self.embed(as_float(patches)).permute(0, 3, 1, 2)
 
     @staticmethod
     def grid(height: int, width: int, patch: int) -> tuple[int, int]:
@@ -82,18 +81,9 @@ class PatchEncoder(nn.Module):
 
 
 class InstructionEncoder(nn.Module):
-    """Word embeddings and a bidirectional GRU (the paper's experimental settings).
+    """Base of the encoders of instructions: each distinct instruction of a batch is encoded once.
 
-    The feature is the forward state after the last word beside the backward state after the first;
-    padding, id 0, changes nothing, and an instruction of padding alone is zeros. Each distinct
-    instruction of a batch is encoded once.
-
-    The recurrence is written out, where ``nn.GRU`` would do, because packed sequences do not work
-    under ``torch.vmap``, which TorchRL's value estimators use.
-
-    >>> encoder = InstructionEncoder(vocabulary_size=40, embedding=8, hidden=64)
-    >>> encoder(torch.randint(40, (5, 16))).shape
-    torch.Size([5, 128])
+    Padding, id 0 at the end, changes nothing.
     """
 
     def __init__(self, vocabulary_size: int, embedding: int, hidden: int) -> None:
@@ -101,13 +91,6 @@ class InstructionEncoder(nn.Module):
         self.hidden = hidden
         self.size = 2 * hidden
         self.embedding = nn.Embedding(vocabulary_size, embedding, padding_idx=0)
-        bound = 1 / math.sqrt(hidden)
-        self.input_weight = nn.Parameter(torch.empty(2, embedding, 3 * hidden))
-        self.input_bias = nn.Parameter(torch.empty(2, 1, 3 * hidden))
-        self.state_weight = nn.Parameter(torch.empty(2, hidden, 3 * hidden))
-        self.state_bias = nn.Parameter(torch.empty(2, 1, 3 * hidden))
-        for weight in (self.input_weight, self.input_bias, self.state_weight, self.state_bias):
-            nn.init.uniform_(weight, -bound, bound)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Map token ids [N, L] to features [N, 2 * hidden].
@@ -120,7 +103,7 @@ class InstructionEncoder(nn.Module):
             return self._encode(tokens)
         distinct, inverse = distinct_rows(tokens)
         if distinct.numel() == 0:
-            return self.state_bias.new_zeros(len(tokens), self.size)
+            return self.embedding.weight.new_zeros(len(tokens), self.size)
         words = self.embedding.num_embeddings
         lowest, highest = distinct.aminmax()
         if lowest < 0 or highest >= words:
@@ -130,6 +113,59 @@ class InstructionEncoder(nn.Module):
             )
         longest = max(int(_lengths(distinct).max()), 1)
         return F.embedding(inverse, self._encode(distinct[:, :longest]))
+
+    def _encode(self, tokens: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+class ConvInstructionEncoder(InstructionEncoder):
+    """Word embeddings, two convolutions over five words each, the maximum over words.
+
+    As good as the GRU here, and several times faster where a batch holds many instructions.
+
+    >>> encoder = ConvInstructionEncoder(vocabulary_size=40, embedding=32, hidden=64)
+    >>> encoder(torch.randint(40, (5, 16))).shape
+    torch.Size([5, 128])
+    """
+
+    def __init__(self, vocabulary_size: int, embedding: int, hidden: int) -> None:
+        super().__init__(vocabulary_size, embedding, hidden)
+        self.first = nn.Conv1d(embedding, hidden, 5, padding=2)
+        self.second = nn.Conv1d(hidden, hidden, 5, padding=2)
+        self.out = nn.Linear(hidden, self.size)
+
+    def _encode(self, tokens: Tensor) -> Tensor:
+        """Encode rows of ids [N, L], of which trailing zeros do not count."""
+        step = torch.arange(tokens.shape[1], device=tokens.device)
+        alive = (step < _lengths(tokens).unsqueeze(1)).unsqueeze(1)
+        words = self.embedding(tokens).transpose(1, 2) * alive
+        words = F.relu(self.first(words)) * alive
+        return self.out((F.relu(self.second(words)) * alive).amax(-1))
+
+
+class GRUInstructionEncoder(InstructionEncoder):
+    """Word embeddings and a bidirectional GRU (the paper's experimental settings).
+
+    The feature is the forward state after the last word beside the backward state after the first;
+    an instruction of padding alone is zeros.
+
+    The recurrence is written out, where ``nn.GRU`` would do, because packed sequences do not work
+    under ``torch.vmap``, which TorchRL's value estimators use.
+
+    >>> encoder = GRUInstructionEncoder(vocabulary_size=40, embedding=8, hidden=64)
+    >>> encoder(torch.randint(40, (5, 16))).shape
+    torch.Size([5, 128])
+    """
+
+    def __init__(self, vocabulary_size: int, embedding: int, hidden: int) -> None:
+        super().__init__(vocabulary_size, embedding, hidden)
+        bound = 1 / math.sqrt(hidden)
+        self.input_weight = nn.Parameter(torch.empty(2, embedding, 3 * hidden))
+        self.input_bias = nn.Parameter(torch.empty(2, 1, 3 * hidden))
+        self.state_weight = nn.Parameter(torch.empty(2, hidden, 3 * hidden))
+        self.state_bias = nn.Parameter(torch.empty(2, 1, 3 * hidden))
+        for weight in (self.input_weight, self.input_bias, self.state_weight, self.state_bias):
+            nn.init.uniform_(weight, -bound, bound)
 
     def _encode(self, tokens: Tensor) -> Tensor:
         """Run the GRU both ways over rows of ids [N, L], of which trailing zeros do not count."""

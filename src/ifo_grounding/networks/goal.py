@@ -9,10 +9,11 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
+from torch import nn
 
 from ifo_grounding import keys
 from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
-from ifo_grounding.networks.instruction import PairScorer
+from ifo_grounding.networks.instruction import PairScorer, begin_with_policy
 
 
 def make_goal_judge(
@@ -21,6 +22,7 @@ def make_goal_judge(
     *,
     in_keys: Sequence[NestedKey] = (keys.INITIAL_PIXELS, keys.PIXELS, keys.INSTRUCTION),
     out_key: NestedKey = keys.GOAL_SCORE,
+    init_from: nn.Module | None = None,
     device: torch.device | str | None = None,
     seed: int | None = None,
     **overrides: Any,
@@ -37,12 +39,15 @@ def make_goal_judge(
         in_keys: the episode's first image and the present one, uint8 [*B, C, H, W], and the
             instruction, int64 [*B, L].
         out_key: where the logit goes.
+        init_from: a policy of the same preset and sizes, whose weights it begins with: of the
+            first image it sees nothing then, until it learns to.
         device: where to build it.
         seed: makes the initial weights a function of the seed alone.
         overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
 
     Raises:
-        UserError: for an unknown preset or option, or sizes that cannot be read.
+        UserError: for an unknown preset or option, sizes that cannot be read, or a policy that
+            does not fit.
 
     >>> from ifo_grounding.networks import Shapes
     >>> judge = make_goal_judge(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
@@ -54,4 +59,6 @@ def make_goal_judge(
     options = {"in_keys": list(in_keys), "out_key": out_key}
     plan = blueprint("goal", spec_source, preset, options, overrides)
     network = construct(partial(PairScorer, images=2), plan, device, seed)
+    if init_from is not None:
+        begin_with_policy(network, init_from, plan)
     return wrap(network, plan, in_keys, [out_key])

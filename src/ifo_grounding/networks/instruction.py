@@ -13,10 +13,21 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from ifo_grounding import keys
-from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
+from ifo_grounding.networks.building import (
+    Blueprint,
+    blueprint,
+    check_keys,
+    construct,
+    wrap,
+)
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import InstructionEncoder
-from ifo_grounding.networks.fusion import GatedAttention, ResidualBlock, ResidualFiLM, pool_cells
+from ifo_grounding.networks.fusion import (
+    CellCount,
+    GatedAttention,
+    ResidualBlock,
+    ResidualFiLM,
+    SpatialReadout,
+)
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.transfer import copy_weights, trunk_of
 from ifo_grounding.networks.trunk import (
@@ -26,6 +37,7 @@ from ifo_grounding.networks.trunk import (
     grid,
     head,
     image_encoder,
+    instruction_encoder,
     same_batch,
 )
 
@@ -35,32 +47,43 @@ class PairScorer(Network):
 
     Images are encoded without the instruction and instructions without the images, so that N
     scenes against P instructions cost N + P encodings and N x P light scores. ``strong`` scores by
-    one residual FiLM block and the maximum and mean over cells; ``paper`` by gated attention.
+    residual FiLM, attention maps that tell places, and counts of the cells that fit; ``paper`` by
+    gated attention.
     """
 
     def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
         super().__init__(shapes, config)
         self.images = images
         self.image = image_encoder(shapes, config, images)
-        self.blocks = nn.Sequential(
-            *(ResidualBlock(config.features) for _ in range(config.n_blocks))
-        )
-        self.instruction = InstructionEncoder(
-            shapes.vocabulary_size, config.embedding, config.hidden
-        )
+        features = config.features
+        self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
+        self.instruction = instruction_encoder(shapes, config)
         self.strong = config.preset == "strong"
-        fusion = ResidualFiLM if self.strong else GatedAttention
-        self.fusion = fusion(self.instruction.size, config.features)
-        size = config.features * (2 if self.strong else math.prod(grid(shapes, config)))
+        size = self.instruction.size
+        if self.strong:
+            self.fusion = nn.ModuleList(
+                ResidualFiLM(size, features, config.kernel) for _ in range(config.n_blocks)
+            )
+            self.readout = SpatialReadout(
+                features, config.heads, config.values, grid(shapes, config)
+            )
+            self.count = CellCount(features, config.detectors)
+            size = self.readout.size + self.count.size
+        else:
+            self.fusion = nn.ModuleList([GatedAttention(size, features)])
+            size = features * math.prod(grid(shapes, config))
         self.head = head(size, config, 1)
+        self.register_buffer("prior", torch.zeros(()))
+
+    prior: Tensor
+    """Added to every logit: the log-odds of suitability before anything is seen, once known."""
 
     def encode_pixels(self, *pixels: Tensor) -> Tensor:
         """Map images, each [*B, C, H, W], to features [*B, F, h, w] that know no instruction."""
         flat = [self.flat_pixels(image) for image in pixels]
         same_batch(**{f"image {number}": batch for number, (_, batch) in enumerate(flat)})
         with self.autocast(pixels[0]):
-            features = F.relu(self.image(torch.cat([image for image, _ in flat], -3)))
-            features = self.blocks(features)
+            features = self.context(self.image(torch.cat([image for image, _ in flat], -3)))
         return features.reshape(*flat[0][1], *features.shape[1:])
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
@@ -73,10 +96,17 @@ class PairScorer(Network):
         same_batch(features=batch, instruction=instruction.shape[:-1])
         with self.autocast(features):
             cells = features.movedim(-3, -1)
-            flat = cells.reshape(-1, *cells.shape[-3:]).contiguous().movedim(-1, -3)
-            fused = F.relu(self.fusion(flat, instruction.reshape(-1, instruction.shape[-1])))
-            outputs = self.head(pool_cells(fused) if self.strong else flatten_cells(fused))
-        return outputs.float().reshape(*batch, 1)
+            fused = cells.reshape(-1, *cells.shape[-3:]).contiguous().movedim(-1, -3)
+            words = instruction.reshape(-1, instruction.shape[-1])
+            for fuse in self.fusion:
+                fused = fuse(fused, words)
+            outputs = self.head(self._summary(F.relu(fused)))
+        return outputs.float().reshape(*batch, 1) + self.prior
+
+    def _summary(self, fused: Tensor) -> Tensor:
+        if not self.strong:
+            return flatten_cells(fused)
+        return torch.cat([self.readout(fused), self.count(fused)], -1)
 
     def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:
         """Score every scene [N, F, h, w] with every instruction [P, D]: logits [N, P].
@@ -100,6 +130,30 @@ class PairScorer(Network):
         return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))
 
 
+def begin_with_policy(network: PairScorer, policy: nn.Module, plan: Blueprint) -> None:
+    """Copy what a policy has learned of words, cells and places; of several images, to the last.
+
+    Raises:
+        UserError: where the weights do not fit.
+    """
+    trunk = trunk_of(policy)
+    parts = [
+        (trunk.context, network.context),
+        (trunk.instruction, network.instruction),
+        (trunk.fusion, network.fusion),
+    ]
+    if trunk.readout is not None:
+        parts.append((trunk.readout, network.readout))
+    copy_weights(parts, policy, plan)
+    mine, theirs = network.image.state_dict(), trunk.image.state_dict()
+    for name, weight in theirs.items():
+        if mine[name].shape == weight.shape:
+            mine[name].copy_(weight)
+        else:  # the first layer, whose inputs are the images' channels, one image after the other
+            mine[name].zero_()
+            mine[name][:, -weight.shape[1] :].copy_(weight)
+
+
 def make_instruction_classifier(
     spec_source: Any,
     preset: str = "strong",
@@ -121,9 +175,9 @@ def make_instruction_classifier(
         preset: ``"strong"`` or ``"paper"``.
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         out_key: where the logit goes; the paper's threshold of 0.8 is on its sigmoid.
-        init_from: a policy of the same preset and sizes whose encoders and first fusion are copied.
-            It has learned what the words look like, which first frames alone teach slowly (an
-            extension of the paper).
+        init_from: a policy of the same preset and sizes whose weights it begins with. It has
+            learned what the words look like, which first frames alone teach slowly (an extension
+            of the paper).
         device: where to build it.
         seed: makes the initial weights a function of the seed alone.
         overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
@@ -144,11 +198,5 @@ def make_instruction_classifier(
     plan = blueprint("instruction", spec_source, preset, options, overrides)
     network = construct(PairScorer, plan, device, seed)
     if init_from is not None:
-        trunk = trunk_of(init_from)
-        parts = [
-            (trunk.image, network.image),
-            (trunk.instruction, network.instruction),
-            (trunk.fusion[0], network.fusion),
-        ]
-        copy_weights(parts, init_from, plan)
+        begin_with_policy(network, init_from, plan)
     return wrap(network, plan, in_keys, [out_key])

@@ -39,7 +39,7 @@ class InverseNetwork(Network):
         self.strong = config.preset == "strong"
         self.image = image_encoder(shapes, config, images=3 if self.strong else 2)
         self.blocks = nn.Sequential(
-            *(ResidualBlock(config.features) for _ in range(config.n_blocks))
+            *(ResidualBlock(config.features) for _ in range(config.context))
         )
         size = config.features * (2 if self.strong else math.prod(grid(shapes, config)))
         self.head = head(size, config, shapes.n_actions)

@@ -15,10 +15,17 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     ConvEncoder,
+    ConvInstructionEncoder,
+    GRUInstructionEncoder,
     InstructionEncoder,
     PatchEncoder,
 )
-from ifo_grounding.networks.fusion import GatedAttention, ResidualFiLM
+from ifo_grounding.networks.fusion import (
+    GatedAttention,
+    ResidualBlock,
+    ResidualFiLM,
+    SpatialReadout,
+)
 from ifo_grounding.networks.shapes import Shapes
 
 
@@ -88,7 +95,7 @@ def image_encoder(shapes: Shapes, config: NetworkConfig, images: int = 1) -> nn.
     if config.preset == "paper":
         return ConvEncoder(channels, config.features, config.conv_layers)
     patch = patch_size(shapes, config)
-    return PatchEncoder(channels, config.features, patch, grid(shapes, config))
+    return PatchEncoder(channels, config.features, patch)
 
 
 def patch_size(shapes: Shapes, config: NetworkConfig) -> int:
@@ -118,30 +125,46 @@ def head(size: int, config: NetworkConfig, outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Dropout(config.dropout), nn.Linear(size, outputs))
 
 
+def instruction_encoder(shapes: Shapes, config: NetworkConfig) -> InstructionEncoder:
+    """Return the configured encoder of instructions."""
+    kind = ConvInstructionEncoder if config.words == "conv" else GRUInstructionEncoder
+    return kind(shapes.vocabulary_size, config.embedding, config.hidden)
+
+
 class Trunk(nn.Module):
-    """Features of an image in the light of an instruction, flattened so that places matter."""
+    """Features of an image in the light of an instruction, with the places they come from."""
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__()
         self.image = image_encoder(shapes, config)
-        self.instruction = InstructionEncoder(
-            shapes.vocabulary_size, config.embedding, config.hidden
-        )
-        size = self.instruction.size
-        self.fusion: nn.ModuleList = nn.ModuleList(
-            [GatedAttention(size, config.features)]
-            if config.preset == "paper"
-            else [ResidualFiLM(size, config.features) for _ in range(config.n_blocks)]
-        )
-        self.size = config.features * math.prod(grid(shapes, config))
+        self.instruction = instruction_encoder(shapes, config)
+        size, features = self.instruction.size, config.features
+        self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
+        self.readout: SpatialReadout | None = None
+        if config.preset == "paper":
+            self.fusion = nn.ModuleList([GatedAttention(size, features)])
+            self.size = features * math.prod(grid(shapes, config))
+        else:
+            self.fusion = nn.ModuleList(
+                ResidualFiLM(size, features, config.kernel) for _ in range(config.n_blocks)
+            )
+            self.readout = SpatialReadout(
+                features, config.heads, config.values, grid(shapes, config)
+            )
+            self.size = self.readout.size
+
+    def fuse(self, image: Tensor, tokens: Tensor) -> Tensor:
+        """Map an image [N, C, H, W] and token ids [N, L] to fused features [N, F, h, w]."""
+        instruction = encode_instruction(self.instruction, tokens)
+        features = self.context(self.image(image))
+        for fuse in self.fusion:
+            features = fuse(features, instruction)
+        return F.relu(features)
 
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
-        instruction = encode_instruction(self.instruction, tokens)
-        features = self.image(image)
-        for fuse in self.fusion:
-            features = fuse(features, instruction)
-        return flatten_cells(F.relu(features))
+        features = self.fuse(image, tokens)
+        return flatten_cells(features) if self.readout is None else self.readout(features)
 
 
 class InstructedNetwork(Network):

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from ifo_grounding.errors import UserError
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
@@ -29,6 +30,7 @@ class GoalLoss(SupervisedLoss):
     Args:
         network: first image, image and instruction to a logit, as ``make_goal_judge`` builds it.
         pool: token ids [P, L] of the instructions of the demonstrations.
+        negatives: how many other instructions each final frame is scored with.
         removal_rate: share of a batch's other instructions to remove, those scored highest, or
             ``"estimated"``.
         warmup: share of training before which none is removed; see :meth:`set_progress`.
@@ -69,11 +71,15 @@ class GoalLoss(SupervisedLoss):
         network: TensorDictModule,
         pool: Tensor,
         *,
+        negatives: int = 8,
         removal_rate: float | str = 0.0,
         warmup: float = 1 / 3,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
+        if negatives < 1:
+            raise UserError(f"negatives must be at least 1, got {negatives}")
+        self.count = negatives
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator)
 
     def set_progress(self, fraction: float) -> None:
@@ -89,10 +95,10 @@ class GoalLoss(SupervisedLoss):
         self._require(tensordict)
         batch = flat(tensordict, self.in_keys)
         final = batch.get(self.tensor_keys.final).reshape(-1).bool()
-        others = self.negatives.draw(batch.get(self.network.in_keys[-1]), 1)
+        others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
-            own, other = pair_scores(self.network, batch, others)
-        other = other[final, 0]
+            own, _ = pair_scores(self.network, batch, others[:, :0])
+            _, other = pair_scores(self.network, batch[final], others[final])
         self.negatives.watch(own[final], other)
         kept = self.negatives.keep(other)
         finished = masked_mean(F.softplus(-own), final)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +17,14 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import (
     ESTIMATED,
+    MOST_REMOVED,
     NegativeInstructions,
     masked_mean,
     pair_scores,
 )
+
+LEAST_SHARE = 1e-4
+"""Shares of suitable pairs below this cannot be told from none."""
 
 
 class InstructionLoss(SupervisedLoss):
@@ -88,6 +93,25 @@ class InstructionLoss(SupervisedLoss):
         """Say which share of training is done, in [0, 1]; until told, training counts as late."""
         self.negatives.progress = fraction
 
+    def calibrate(self) -> float:
+        """Let the network's probabilities count how rare suitable pairs are; return their share.
+
+        In training positives and negatives weigh the same, so that a probability is that of a pair
+        which is suitable as likely as not. Afterwards it is that of a random pair of a fresh scene
+        and the pool, and a threshold means the same for pools in which one of three instructions
+        suits and for those in which one of three hundred does.
+
+        Raises:
+            UserError: where the share is unknown, for the removal rate was given.
+        """
+        estimate = self.negatives.estimate
+        if estimate is None:
+            raise UserError("calibrate needs removal_rate='estimated'")
+        share = min(max(estimate.share(), LEAST_SHARE), MOST_REMOVED)
+        prior = self.network.get_buffer("module.prior")
+        prior.fill_(math.log(share / (1 - share)))
+        return share
+
     def _extra_keys(self) -> list[NestedKey]:
         return []
 
@@ -99,7 +123,7 @@ class InstructionLoss(SupervisedLoss):
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
             own, other = pair_scores(self.network, batch, others)
-        self.negatives.watch(own, other[:, 0])
+        self.negatives.watch(own, other)
         kept = self.negatives.keep(other)
         loss = (F.softplus(-own).mean() + masked_mean(F.softplus(other), kept)) / 2
         return scalars(

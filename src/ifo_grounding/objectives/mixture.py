@@ -44,9 +44,10 @@ class MixtureEstimate(nn.Module):
     """Remembers recent scores of positives and unlabelled samples, and estimates from them.
 
     Args:
-        size: scores of each kind to remember.
+        size: scores of positives to remember.
+        ratio: how many unlabelled ones to remember for each of them.
 
-    >>> estimate = MixtureEstimate(size=100)
+    >>> estimate = MixtureEstimate(size=100, ratio=1)
     >>> estimate.add(torch.ones(60), torch.cat([torch.ones(30), -torch.ones(30)]))
     >>> estimate.share()
     0.5
@@ -56,24 +57,27 @@ class MixtureEstimate(nn.Module):
     unlabelled: Tensor
     count: Tensor
 
-    def __init__(self, size: int = 4096) -> None:
+    def __init__(self, size: int = 4096, ratio: int = 8) -> None:
         super().__init__()
-        self.size = size
         self.register_buffer("positive", torch.zeros(size))
-        self.register_buffer("unlabelled", torch.zeros(size))
-        self.register_buffer("count", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("unlabelled", torch.zeros(size * ratio))
+        self.register_buffer("count", torch.zeros(2, dtype=torch.int64))
 
     @torch.no_grad()
     def add(self, positive: Tensor, unlabelled: Tensor) -> None:
-        """Remember scores, the same number of each kind [N]; the oldest are forgotten."""
-        places = (self.count + torch.arange(len(positive), device=self.count.device)) % self.size
-        self.positive[places] = positive.detach().float()
-        self.unlabelled[places] = unlabelled.detach().float()
-        self.count += len(positive)
+        """Remember scores, [N] and [M]; the oldest are forgotten."""
+        for kind, (memory, scores) in enumerate(
+            [(self.positive, positive), (self.unlabelled, unlabelled)]
+        ):
+            scores = scores.detach().flatten().float()[-len(memory) :]
+            places = torch.arange(len(scores), device=memory.device) + self.count[kind]
+            memory[places % len(memory)] = scores
+            self.count[kind] += len(scores)
 
     def share(self) -> float:
         """Estimate the share of positives among the unlabelled; 0 before there are any scores."""
-        known = min(int(self.count), self.size)
-        if not known:
-            return 0.0
-        return best_bin_estimate(self.positive[:known], self.unlabelled[:known])
+        positive, unlabelled = (
+            memory[: int(count)]
+            for memory, count in zip((self.positive, self.unlabelled), self.count, strict=True)
+        )
+        return best_bin_estimate(positive, unlabelled) if len(positive) else 0.0

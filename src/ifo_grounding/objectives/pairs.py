@@ -12,6 +12,9 @@ from ifo_grounding.objectives.mixture import MixtureEstimate
 
 ESTIMATED = "estimated"
 MOST_REMOVED = 0.5
+LEAST_REMOVED = 0.05
+"""Where fewer pairs than this are suitable, false negatives hardly matter, and what an imperfect
+classifier would remove are mostly the hardest true ones."""
 
 
 class NegativeInstructions(nn.Module):
@@ -79,10 +82,11 @@ class NegativeInstructions(nn.Module):
         return self.pool[torch.where(same, moved, index)]
 
     def watch(self, own: Tensor, other: Tensor) -> None:
-        """Learn the share of suitable negatives from scores of positives [N] and negatives [N]."""
+        """Learn the share of suitable negatives from scores of positives [N] and negatives [M]."""
         if self.estimate is not None:
             self.estimate.add(own, other)
-            self.removal_rate = min(self.estimate.share(), MOST_REMOVED)
+            share = min(self.estimate.share(), MOST_REMOVED)
+            self.removal_rate = share if share >= LEAST_REMOVED else 0.0
 
     def keep(self, scores: Tensor) -> Tensor:
         """Return a mask of ``scores`` [*] without the top share that is likely suitable."""

@@ -2,6 +2,8 @@
 
 from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
+from ifo_grounding.training.cloning import accepted, accepted_steps
+from ifo_grounding.training.held_out import HeldOut
 from ifo_grounding.training.pairs import load_pairs, save_pairs, select_pairs
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.training.self_examination import SelfExaminationConfig, self_examine
@@ -11,9 +13,12 @@ __all__ = [
     "Adversary",
     "Checkpoint",
     "FitConfig",
+    "HeldOut",
     "Run",
     "SelfExaminationConfig",
     "Stage",
+    "accepted",
+    "accepted_steps",
     "fingerprint",
     "fit",
     "load_pairs",

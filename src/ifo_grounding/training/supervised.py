@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -24,6 +24,18 @@ Callback = Callable[[int], Metrics]
 Log = Callable[[Metrics, int], None]
 
 
+class Validation(Protocol):
+    """Measures a network on held-out samples, and remembers the best weights."""
+
+    def look(self) -> float: ...  # noqa: D102
+
+    def restore(self) -> None: ...  # noqa: D102
+
+    def state_dict(self) -> dict[str, Any]: ...  # noqa: D102
+
+    def load_state_dict(self, state: dict[str, Any]) -> Any: ...  # noqa: D102
+
+
 @dataclass(frozen=True)
 class FitConfig:
     """How long and how fast to learn."""
@@ -36,7 +48,7 @@ class FitConfig:
     """Peak learning rate (paper: 8e-4)."""
     schedule: str = "cosine"
     """``constant``, or ``cosine``: a short warm-up, then down to zero."""
-    warmup: float = 0.02
+    warmup: float = 0.1
     """Share of the steps that warm up, with ``cosine``."""
     weight_decay: float = 0.0
     """Decoupled weight decay; 0 makes AdamW the paper's Adam."""
@@ -46,10 +58,12 @@ class FitConfig:
     """Steps between two points where a killed run can continue."""
     evaluate_every: int = 0
     """Iterations between two calls of the callback; 0 calls it at the end only."""
+    validate_every: int = 4
+    """Iterations between two looks at the held-out loss, where there is one."""
 
     def __post_init__(self) -> None:
         """Refuse sizes that cannot be."""
-        for name in ("steps", "batch_size", "iteration"):
+        for name in ("steps", "batch_size", "iteration", "validate_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.schedule not in ("constant", "cosine"):
@@ -104,6 +118,7 @@ def fit(
     checkpoint_seconds: float = 15.0,
     log: Log | None = None,
     callback: Callback | None = None,
+    held_out: Validation | None = None,
     progress: bool = False,
     settings: Any = None,
 ) -> list[Metrics]:
@@ -120,6 +135,8 @@ def fit(
         checkpoint_seconds: least time between two checkpoints.
         log: gets the mean metrics of each iteration and the step.
         callback: gets the step, returns further metrics.
+        held_out: measures the loss on held-out samples (``held_out_loss``); the weights that did
+            best there are kept in the end.
         progress: whether to show a progress bar.
         settings: what else decides the result; a checkpoint made with other settings is refused.
 
@@ -127,7 +144,11 @@ def fit(
         Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
     """
     optimizer = make_optimizer(loss.parameters(), config.lr, config.weight_decay)
-    saved = _saved(checkpoint, fingerprint(config, seed, name, settings), loss, optimizer)
+    saved = None
+    if checkpoint:
+        parts: dict[str, Any] = {"loss": loss, "optimizer": optimizer}
+        parts |= {"held_out": held_out} if held_out else {}
+        saved = Checkpoint(checkpoint, fingerprint(config, seed, name, settings), **parts)
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
     history: list[Metrics] = state["history"]
     iterations = math.ceil(config.steps / config.iteration)
@@ -139,6 +160,11 @@ def fit(
             steps = range(first, min(first + config.iteration, config.steps))
             metrics = _iterate(loss, buffer, optimizer, config, steps)
             done = iteration + 1
+            if held_out:
+                if done % config.validate_every == 0 or done == iterations:
+                    metrics["held_out_loss"] = held_out.look()
+                if done == iterations:
+                    held_out.restore()
             due = config.evaluate_every and done % config.evaluate_every == 0
             if callback and (due or done == iterations):
                 metrics |= callback(steps.stop)
@@ -175,12 +201,6 @@ def _iterate(
     means = {key: float(value) / len(steps) for key, value in sums.items()}
     speed = len(steps) * config.batch_size / elapsed
     return {"step": float(steps.stop), **means, "samples_per_second": speed}
-
-
-def _saved(
-    path: str | Path | None, settings: str, loss: nn.Module, optimizer: torch.optim.Optimizer
-) -> Checkpoint | None:
-    return Checkpoint(path, settings, loss=loss, optimizer=optimizer) if path else None
 
 
 def _bar(total: int, initial: int, name: str, progress: bool) -> Any:

@@ -1,0 +1,38 @@
+"""One seed of a comparison: both phases and both controls, on the same evaluation scenes.
+
+python recipes/study.py task=move budget=study demonstrations.n=1000 seed=0 results=results/study
+"""
+
+from pathlib import Path
+
+from controls import clone_accepted, continue_imitation
+from evaluate import evaluate
+from omegaconf import DictConfig
+from two_phase import train_phases, write_result
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.files import write_json
+from ifo_grounding.report import results_table
+
+
+def study(options: DictConfig) -> dict:
+    train_phases(options)
+    if options.controls.run:
+        continue_imitation(options)
+        clone_accepted(options)
+    results = evaluate(options)
+    content = write_result(options, results, "run study")
+    folder = options.results
+    if folder:
+        name = f"{options.task}-{options.demonstrations.n}-{options.network}-seed{options.seed}"
+        write_json(Path(folder) / f"{name}.json", content)
+    return results
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    print(results_table(study(options)))
+
+
+if __name__ == "__main__":
+    main()
