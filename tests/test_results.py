@@ -3,6 +3,8 @@
 import importlib.util
 from pathlib import Path
 
+from ifo_grounding.files import write_json
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -21,10 +23,36 @@ def test_the_tables_are_up_to_date():
 
 
 def test_every_result_says_where_it_comes_from():
-    for run in load_script().runs():
-        assert run["command"].startswith("ifo-grounding demo")
+    script = load_script()
+    studied = [run for seeds in script.studies().values() for run in seeds]
+    for run in [*script.runs(), *studied]:
+        command = "run study" if run in studied else "demo"
+        assert run["command"].startswith(f"ifo-grounding {command}")
         assert run["provenance"]["commit"]
         assert not run["provenance"]["commit"].endswith("+"), "made from files that changed since"
         assert run["options"]["seed"] is not None
         assert run["seconds"] > 0
         assert run["results"]["phase1"]["rate"]["count"] >= 2000
+
+
+def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
+    script = load_script()
+    (tmp_path / "results" / "study").mkdir(parents=True)
+    solved = {"phase1": "f0", "phase2": "fc", "continued": "f8"}
+    for seed in range(2):
+        results = {name: {"outcomes": bits, "rate": {"count": 8}} for name, bits in solved.items()}
+        results["suitability"] = {"rate": {"rate": 0.9}, "served": {"rate": 0.5}}
+        options = {"task": "pick", "demonstrations": {"n": 2000}, "network": "strong", "seed": seed}
+        run = {
+            "options": options,
+            "results": results,
+            "command": f"ifo-grounding run study seed={seed}",
+            "provenance": {"commit": "abc"},
+        }
+        write_json(tmp_path / "results" / "study" / f"{seed}.json", run)
+    monkeypatch.setattr(script, "ROOT", tmp_path)
+    first = next(iter(script.studies().values()))
+    assert script.outcomes(first, "phase2").tolist() == [[True] * 6 + [False] * 2] * 2
+    table = "\n".join(script.study_section())
+    for shown in ("| pick | 2,000 | strong | 2 |", "50.0%", "75.0%", "+25.0", "+12.5", "not run"):
+        assert shown in table

@@ -3,6 +3,7 @@ import torch
 from torch import nn
 
 from ifo_grounding.networks import (
+    CellCount,
     CellLinear,
     GatedAttention,
     ResidualBlock,
@@ -93,3 +94,16 @@ def test_a_readout_of_one_row_of_cells_is_finite():
     readout = SpatialReadout(2, heads=3, values=4, grid=(1, 4))
     assert readout(torch.randn(2, 2, 1, 4)).isfinite().all()
     assert readout.size == 3 * 6
+
+
+def test_counts_tell_one_cell_from_two():
+    count = CellCount(1, detectors=1)
+    with torch.no_grad():
+        count.detect.weight.fill_(20.0)
+        count.detect.bias.fill_(-10.0)
+    image = torch.zeros(3, 1, 6, 6)
+    image[1, 0, 2, 2] = 1
+    image[2, 0, 2, 2:4] = 1
+    found = count(image)
+    torch.testing.assert_close(found[:, 0], torch.tensor([0.0, 1.0, 2.0]), atol=5e-3, rtol=0)
+    torch.testing.assert_close(found[:, 1], torch.tanh(found[:, 0]))

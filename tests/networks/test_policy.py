@@ -11,6 +11,7 @@ from torchrl.objectives.value import GAE
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import (
     Shapes,
+    make_goal_judge,
     make_instruction_classifier,
     make_inverse,
     make_policy,
@@ -135,3 +136,13 @@ def test_an_instruction_module_begins_with_what_the_policy_learned(shapes, prese
     assert all(torch.equal(trunk.fusion.state_dict()[name], w) for name, w in fusion.items())
     with pytest.raises(UserError, match="does not fit"):
         make_instruction_classifier(shapes, preset, init_from=policy, embedding=5)
+
+
+@pytest.mark.parametrize("preset", ["strong", "paper"])
+def test_a_goal_judge_begins_with_what_the_policy_sees_in_the_present_image(shapes, preset):
+    policy = make_policy(shapes, preset, seed=0)
+    judge = make_goal_judge(shapes, preset, init_from=policy, seed=1)
+    first, other, now = torch.randint(256, (3, 5, *shapes.image_shape), dtype=torch.uint8)
+    features = judge.encode_pixels(first, now)
+    assert torch.equal(features, judge.encode_pixels(other, now))
+    torch.testing.assert_close(features, trunk_of(policy).image(now))

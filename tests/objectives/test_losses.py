@@ -11,6 +11,7 @@ from torch.distributions import Categorical
 from torchrl.modules import OneHotCategorical, ProbabilisticActor
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks import Shapes, make_instruction_classifier
 from ifo_grounding.objectives import (
     GoalLoss,
     ImitationLoss,
@@ -18,6 +19,7 @@ from ifo_grounding.objectives import (
     InverseLoss,
     RewardLoss,
 )
+from ifo_grounding.objectives.pairs import NegativeInstructions
 from objectives.conftest import POOL, batch, make_loss
 
 LOGITS = torch.log(torch.tensor([[0.5, 0.25, 0.25], [0.1, 0.1, 0.8]]))
@@ -234,3 +236,28 @@ def test_a_batch_without_one_class_still_has_a_finite_loss(final):
     out = loss(batch().set("final", torch.full((12, 1), final)))
     assert out["loss_goal"].isfinite()
     out["loss_goal"].backward()
+
+
+def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
+    torch.manual_seed(0)
+    shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    classifier = make_instruction_classifier(shapes, seed=0, features=16)
+    pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
+    loss = InstructionLoss(classifier, pool, removal_rate="estimated")
+    image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), pool[:2]
+    before = classifier(pixels=image, instruction=words)
+    loss.negatives.watch(torch.ones(1000), torch.cat([torch.ones(250), -torch.ones(750)]))
+    assert loss.calibrate() == pytest.approx(0.25)
+    after = classifier(pixels=image, instruction=words)
+    torch.testing.assert_close(after, before - math.log(3))
+    with pytest.raises(UserError, match="estimated"):
+        InstructionLoss(classifier, pool, removal_rate=0.3).calibrate()
+
+
+def test_few_suitable_pairs_are_not_removed():
+    pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
+    negatives = NegativeInstructions(pool, "estimated")
+    negatives.watch(torch.ones(1000), torch.cat([torch.ones(40), -torch.ones(960)]))
+    assert negatives.removal_rate == 0
+    negatives.watch(torch.ones(1000), torch.cat([torch.ones(800), -torch.ones(200)]))
+    assert negatives.removal_rate == pytest.approx(840 / 2000, abs=0.02)

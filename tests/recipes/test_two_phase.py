@@ -51,6 +51,25 @@ def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, pre
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
 
 
+def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
+    from controls import matched_steps
+    from study import study
+
+    options = compose(
+        "study", f"results={tmp_path / 'results'}", "self_examine.steps=20", "imitate.lr=1e-4"
+    )
+    results = study(options)
+    names = ("phase1", "phase2", "continued", "cloned")
+    assert len({results[name]["scenes"] for name in names}) == 1
+    assert all(len(bytes.fromhex(results[name]["outcomes"])) == 7 for name in names)  # 50 scenes
+    section = options.self_examine
+    frames = section.iterations * section.num_envs * section.steps
+    assert matched_steps(options) == round(frames * (2 * section.epochs + 1 / 3) / 256)
+    [path] = (tmp_path / "results").glob("*.json")
+    assert path.name == "move-300-strong-seed0.json"
+    assert json.loads(path.read_text())["results"]["cloned"]["outcomes"]
+
+
 def test_a_changed_option_redoes_what_depends_on_it(compose, tmp_path):
     from imitate import imitate
     from label import label
