@@ -154,3 +154,27 @@ def test_entropy_by_hand():
         0.75 * math.log2(4 / 3) + 0.25 * 2
     )
     assert entropy_bits(torch.tensor([5, 5])) == 0.0
+
+
+@pytest.mark.parametrize(("task", "share"), [("move", 1.0), ("pick", 0.62), ("pick-out", 0.56)])
+def test_not_every_state_has_a_suitable_instruction(task, share):
+    nothing = TensorDictModule(
+        lambda pixels, instruction: torch.full((len(pixels), 1), -9.0),
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+    pool = grammar(task).tokens[:: len(grammar(task).phrasings)]
+    result = suitable_rate(nothing, task, pool, states=600, pairs_per_state=0)
+    assert result.servable.count == 500
+    assert result.servable.low - 0.01 < share < result.servable.high + 0.01
+
+
+def test_a_state_is_servable_if_one_instruction_of_the_pool_suits_it():
+    nothing = TensorDictModule(
+        lambda pixels, instruction: torch.full((len(pixels), 1), -9.0),
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+    pool = ["move to the red circle", "move to the red circle"]
+    result = suitable_rate(nothing, "move", pool, states=400, pairs_per_state=400)
+    assert result.servable.rate == pytest.approx(result.base_rate.rate)

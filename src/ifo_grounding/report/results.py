@@ -46,6 +46,8 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     if choices := results.get("suitability"):
         add("suitable rate of chosen instructions", restored(Rate, choices["rate"]))
         add("states served", restored(Rate, choices["served"]))
+        if "servable" in choices:
+            add("states that an instruction suits", restored(Rate, choices["servable"]))
         add("recall of suitable pairs", restored(Rate, choices["recall"]))
     if reward := results.get("action_reward"):
         add("action reward against the expert, AUC", restored(Estimate, reward["auc"]))
