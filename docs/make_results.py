@@ -126,10 +126,9 @@ def page(found: list[dict[str, Any]]) -> str:
         " a result over seeds.",
         overview(found),
         "A gain of exactly 0 means that no policy of phase 2 had a clearly higher learned return,"
-        " so that phase 1's was kept. At this budget, some 60,000 steps of practice, phase 2 does"
-        " not improve the policy. With `pick-out` the instruction module is the limit: 3 in 1,000"
-        " random pairs are suitable, random negatives are too easy to teach so fine a choice, and"
-        " most chosen instructions name an object that is not in the box.",
+        " so that phase 1's was kept. The runs of commit `f4fc2f9` and before are of an earlier"
+        " preset `strong`, which flattened its feature map; see the changelog. They have not been"
+        " repeated with the present one.",
     ]
     parts += study_section()
     for run in found:

@@ -1,36 +1,73 @@
-"""Success of a policy in training, on validation scenes: for the log, never for the learner."""
+"""What a policy in training truly does, on validation scenes: for the log alone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from _shared import world
+from _shared import CLASSIFIER, REWARD, load_demonstrations, load_network, world
 from omegaconf import DictConfig
 from torch import nn
 
-from ifo_grounding.evaluation import success_rate
+from ifo_grounding.data import record_demonstrations
+from ifo_grounding.evaluation import (
+    return_correlation,
+    reward_audit,
+    success_rate,
+    suitable_rate,
+)
+from ifo_grounding.training import Run
+from ifo_grounding.transforms import LearnedReward
+
+EXPERT_EPISODES = 200
 
 
-def audit_callback(policy: nn.Module, options: DictConfig) -> Callable[[int], dict[str, float]]:
-    """Return a callback that measures greedy and sampled success on validation scenes."""
+def audit_callback(
+    policy: nn.Module, reward: LearnedReward, run: Run, options: DictConfig
+) -> Callable[[int], dict[str, float]]:
+    """Return a callback that lets the oracle judge the policy, its instructions and its judges."""
+    shown = {
+        "seed": options.evaluate.seed,
+        "stream": "validation",
+        **world(options),
+    }
+    episodes = options.evaluate.audit_episodes
 
     def audit(step: int) -> dict[str, float]:
-        result = success_rate(
-            policy,
-            options.task,
-            mode="both",
-            episodes=options.evaluate.audit_episodes,
-            seed=options.evaluate.seed,
-            stream="validation",
-            **world(options),
-        )
+        result = success_rate(policy, options.task, mode="both", episodes=episodes, **shown)
         assert result.sampled is not None
+        played = return_correlation(policy, reward, options.task, episodes=episodes, **shown)
         return {
             "success": result.rate.rate,
             "success_low": result.rate.low,
             "success_high": result.rate.high,
             "success_sampled": result.sampled.rate.rate,
             "success_stopped": result.stopped.rate,
+            "audit_return": float(played.returns.mean()),
+            "audit_success": played.success.rate,
+            "judge_auc": played.auc.value,
+            **instructions(),
+            **actions(),
         }
+
+    def instructions() -> dict[str, float]:
+        chosen = suitable_rate(
+            load_network(run, CLASSIFIER, "train_instruction", options),
+            options.task,
+            load_demonstrations(run).pool(),
+            states=episodes,
+            pairs_per_state=0,
+            **{key: options.instruction[key] for key in ("threshold", "candidates", "choose")},
+            **shown,
+        )
+        return {"suitable": chosen.rate.rate}
+
+    def actions() -> dict[str, float]:
+        if options.self_examine.kind == "goal":
+            return {}
+        demos, truth = record_demonstrations(
+            options.task, EXPERT_EPISODES, keep_truth=True, **shown
+        )
+        judge = load_network(run, REWARD, "train_reward", options)
+        return {"action_auc": reward_audit(judge, demos, truth).auc.value}
 
     return audit

@@ -13,6 +13,7 @@ from ifo_grounding.evaluation import Rate, record_episodes
 from ifo_grounding.files import read_json
 from ifo_grounding.report import (
     animation,
+    audit_figure,
     improved_episodes,
     instruction_cases,
     results_rows,
@@ -108,6 +109,8 @@ def curves(run: Run) -> dict[str, Any]:
             if all(name in row for row in history)
         }
         found[title] = training_curves(metrics)
+        if stage == "self_examine":
+            found["Audit of self-examination (validation scenes)"] = audit_figure(history)
         audited = [row for row in history if "success" in row]
         if len(audited) > 1:
             rates = [

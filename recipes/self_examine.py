@@ -55,7 +55,7 @@ def examine(options: DictConfig) -> dict:
         adversary=adversary,
         checkpoint=stage.checkpoint,
         log=stage.log(),
-        callback=audit_callback(policy, options),
+        callback=audit_callback(policy, reward, run, options),
         progress=shows_progress(options),
         settings=stage.settings,
     )

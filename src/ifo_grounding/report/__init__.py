@@ -1,6 +1,7 @@
 """Showing what was learned: tables, plots, animations, case studies, and one page with all."""
 
 from ifo_grounding.report.animation import animation, save_animation
+from ifo_grounding.report.audit import audit_figure
 from ifo_grounding.report.casestudy import (
     Case,
     changed_scenes,
@@ -25,6 +26,7 @@ from ifo_grounding.report.tables import format_cell, markdown_table, text_table
 __all__ = [
     "Case",
     "animation",
+    "audit_figure",
     "changed_scenes",
     "confusion",
     "figure_png",
