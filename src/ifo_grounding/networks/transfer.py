@@ -16,7 +16,7 @@ def trunk_of(policy: nn.Module) -> Trunk:
 
     >>> from ifo_grounding.networks import Shapes, make_policy
     >>> trunk_of(make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))).size
-    2304
+    144
     """
     trunks = [part.trunk for part in policy.modules() if isinstance(part, InstructedNetwork)]
     if len(trunks) != 1:
