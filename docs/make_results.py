@@ -97,21 +97,13 @@ def overview(found: list[dict[str, Any]]) -> str:
             {
                 "task": options["task"],
                 "demonstrations": options["demonstrations"]["n"],
-                "phase 1": short(results["phase1"]["rate"]),
-                "phase 2": short(results["phase2"]["rate"]),
-                "gain, points": short_gain(results["gain"]),
-                "suitable rate": short(results["suitability"]["rate"]),
+                "phase 1": brief(restored(Rate, results["phase1"]["rate"])),
+                "phase 2": brief(restored(Rate, results["phase2"]["rate"])),
+                "gain, points": brief(restored(Difference, results["gain"])),
+                "suitable rate": brief(restored(Rate, results["suitability"]["rate"])),
             }
         )
     return markdown_table(rows)
-
-
-def short(rate: dict[str, Any]) -> str:
-    return str(restored(Rate, rate)).rpartition(" (")[0]
-
-
-def short_gain(gain: dict[str, Any]) -> str:
-    return str(restored(Difference, gain)).rpartition(" (")[0].replace(" points", "")
 
 
 def page(found: list[dict[str, Any]]) -> str:

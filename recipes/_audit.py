@@ -31,6 +31,8 @@ def audit_callback(
         **world(options),
     }
     episodes = options.evaluate.audit_episodes
+    classifier = load_network(run, CLASSIFIER, "train_instruction", options)
+    pool = load_demonstrations(run).pool()
 
     def audit(step: int) -> dict[str, float]:
         result = success_rate(policy, options.task, mode="both", episodes=episodes, **shown)
@@ -51,9 +53,9 @@ def audit_callback(
 
     def instructions() -> dict[str, float]:
         chosen = suitable_rate(
-            load_network(run, CLASSIFIER, "train_instruction", options),
+            classifier,
             options.task,
-            load_demonstrations(run).pool(),
+            pool,
             states=episodes,
             pairs_per_state=0,
             **{key: options.instruction[key] for key in ("threshold", "candidates", "choose")},

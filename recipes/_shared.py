@@ -108,8 +108,9 @@ def train(
     file: str,
     held_out: HeldOut | None = None,
     finish: Callable[[], Any] | None = None,
+    **found: float,
 ) -> dict:
-    """Fit a network to a buffer, do what is left to do, save it, and finish the stage."""
+    """Fit a network to a buffer, do what is left to do, save it, and finish with what was found."""
     history = fit(
         loss,
         buffer,
@@ -126,7 +127,7 @@ def train(
     if finish is not None:
         finish()
     networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
-    return stage.finish(history[-1], history)
+    return stage.finish({**history[-1], **found}, history)
 
 
 def fit_config(section: DictConfig) -> FitConfig:

@@ -6,23 +6,19 @@ import torch
 from _shared import (
     CONTROLS,
     POLICIES,
-    fit_config,
     load_network,
     open_stage,
-    shows_progress,
-    simulator,
+    train,
 )
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig, OmegaConf
-from self_examine import chosen_starts, learned_reward
+from self_examine import practice
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, TransformedEnv
 
-from ifo_grounding import networks
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.training import HeldOut, Stage, accepted_steps, fit
+from ifo_grounding.training import HeldOut, Stage, accepted_steps
 
 
 def continue_imitation(options: DictConfig) -> dict:
@@ -43,10 +39,7 @@ def clone_accepted(options: DictConfig) -> dict:
     stage = open_stage(options, "clone_accepted", sections, needs)
     if stage.result is None:
         section, run = options.self_examine, stage.run
-        reward, _ = learned_reward(run, options)
-        env = TransformedEnv(
-            simulator(options, section.num_envs), Compose(chosen_starts(run, options), reward)
-        )
+        env, _, _ = practice(run, options)
         rollouts = accepted_steps(
             env,
             load_network(run, POLICIES[0], "imitate", options),
@@ -72,23 +65,10 @@ def imitate_on(
         validation.look()  # phase 1 itself is the one to beat
     if rollouts is not None:
         buffer = Both(buffer, rollouts)
-    settings = {"steps": matched_steps(options), "lr": options.controls.lr}
-    config = fit_config(OmegaConf.merge(options.imitate, settings))
-    history = fit(
-        loss,
-        buffer,
-        config,
-        seed=options.seed,
-        name=stage.name,
-        checkpoint=stage.checkpoint,
-        log=stage.log(),
-        held_out=validation,
-        progress=shows_progress(options),
-        settings=stage.settings,
-    )
-    networks.save(policy, run / file)
+    settings = {"imitate": {"steps": matched_steps(options), "lr": options.controls.lr}}
     accepted = {} if rollouts is None else {"accepted": float(len(rollouts))}
-    return stage.finish({**history[-1], **accepted}, history)
+    longer = OmegaConf.merge(options, settings)
+    return train(longer, stage, loss, buffer, "imitate", file, held_out=validation, **accepted)
 
 
 def matched_steps(options: DictConfig) -> int:

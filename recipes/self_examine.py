@@ -42,10 +42,7 @@ def examine(options: DictConfig) -> dict:
     run = stage.run
     policy = load_network(run, POLICIES[0], "imitate", options)
     value = build(networks.make_value, options, init_from=policy)
-    reward, adversary = learned_reward(run, options)
-    env = TransformedEnv(
-        simulator(options, section.num_envs), Compose(chosen_starts(run, options), reward)
-    )
+    env, reward, adversary = practice(run, options)
     history = self_examine(
         env,
         policy,
@@ -61,6 +58,16 @@ def examine(options: DictConfig) -> dict:
     )
     networks.save(policy, run / POLICIES[1])
     return stage.finish(history[-1], history)
+
+
+def practice(
+    run: Run, options: DictConfig
+) -> tuple[TransformedEnv, LearnedReward, Adversary | None]:
+    """Return the env to practise in, its reward and, where that is to be trained on, what does."""
+    reward, adversary = learned_reward(run, options)
+    world = simulator(options, options.self_examine.num_envs)
+    env = TransformedEnv(world, Compose(chosen_starts(run, options), reward))
+    return env, reward, adversary
 
 
 def learned_reward(run: Run, options: DictConfig) -> tuple[LearnedReward, Adversary | None]:

@@ -147,7 +147,8 @@ def suitable_rate(
             generator=draw,
         )
         judged = _judge(state, index, score, goals, max_steps)
-        servable += _servable(state[: SERVABLE_STATES - len(servable)], goals, max_steps)
+        if left := SERVABLE_STATES - len(servable):
+            servable += _servable(state[:left], goals, max_steps)
         chosen.append(judged.chosen.cpu())
         verdicts.append(judged.verdict.cpu())
         if pairs_per_state:
@@ -253,7 +254,7 @@ def _judge(state: WorldState, index: Tensor, score: Tensor, goals: Goal, max_ste
 
 def _servable(state: WorldState, goals: Goal, max_steps: int) -> list[bool]:
     """Say for each state [B] whether any goal of the pool suits it."""
-    _, numbers = _goal_numbers(goals).unique(return_inverse=True)
+    numbers = _goal_numbers(goals)
     rows = torch.arange(len(numbers), device=numbers.device)
     distinct = rows.new_zeros(int(numbers.max()) + 1).scatter_(0, numbers, rows)
     found = torch.zeros(len(state), dtype=torch.bool, device=state.arm.device)

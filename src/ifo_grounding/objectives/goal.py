@@ -97,17 +97,22 @@ class GoalLoss(SupervisedLoss):
         final = batch.get(self.tensor_keys.final).reshape(-1).bool()
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
-            own, _ = pair_scores(self.network, batch, others[:, :0])
-            _, other = pair_scores(self.network, batch[final], others[final])
-        self.negatives.watch(own[final], other)
+            own, other = pair_scores(self.network, batch[final], others[final])
+            early, _ = pair_scores(self.network, batch[~final], others[~final, :0])
+        self.negatives.watch(own, other)
         kept = self.negatives.keep(other)
-        finished = masked_mean(F.softplus(-own), final)
-        unfinished = masked_mean(F.softplus(own), ~final)
+        finished = mean_or_zero(F.softplus(-own))
+        unfinished = mean_or_zero(F.softplus(early))
         elsewhere = masked_mean(F.softplus(other), kept)
         return scalars(
             loss_goal=(finished + (unfinished + elsewhere) / 2) / 2,
-            final_probability=masked_mean(own.detach().sigmoid(), final),
-            unfinished_probability=masked_mean(own.detach().sigmoid(), ~final),
-            negative_probability=masked_mean(other.detach().sigmoid(), torch.ones_like(kept)),
-            removed=masked_mean((~kept).float(), torch.ones_like(kept)),
+            final_probability=mean_or_zero(own.detach().sigmoid()),
+            unfinished_probability=mean_or_zero(early.detach().sigmoid()),
+            negative_probability=mean_or_zero(other.detach().sigmoid()),
+            removed=mean_or_zero((~kept).float()),
         )
+
+
+def mean_or_zero(values: Tensor) -> Tensor:
+    """Return the mean of ``values``, 0 where there are none."""
+    return masked_mean(values, torch.ones_like(values, dtype=torch.bool))
