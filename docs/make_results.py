@@ -26,12 +26,14 @@ def runs() -> list[dict[str, Any]]:
 
 
 def studies() -> dict[tuple[str, int, str], list[dict[str, Any]]]:
-    """Return the committed seeds of each study: task, demonstrations, preset."""
+    """Return the committed seeds of each study: task, demonstrations, preset and variant."""
     found: dict[tuple[str, int, str], list[dict[str, Any]]] = {}
     for path in sorted((ROOT / "results" / "study").glob("*.json")):
         run = read_json(path)
         options = run["options"]
-        key = (options["task"], options["demonstrations"]["n"], options["network"])
+        variant = options.get("variant")
+        kind = f"{options['network']}, {variant}" if variant else options["network"]
+        key = (options["task"], options["demonstrations"]["n"], kind)
         found.setdefault(key, []).append(run)
     return dict(sorted(found.items(), key=lambda item: (TASKS.index(item[0][0]), item[0][1:])))
 
@@ -49,12 +51,12 @@ def outcomes(runs: list[dict[str, Any]], name: str) -> np.ndarray:
 def study_section() -> list[str]:
     """Return what the studies over seeds found."""
     rows, commands = [], []
-    for (task, n, network), runs in studies().items():
+    for (task, n, kind), runs in studies().items():
         both = outcomes(runs, "phase1"), outcomes(runs, "phase2")
         row = {
             "task": task,
             "demonstrations": f"{n:,}",
-            "preset": network,
+            "preset": kind,
             "seeds": len(runs),
             "phase 1": brief(two_level_bootstrap(both[0])),
             "phase 2": brief(two_level_bootstrap(both[1])),

@@ -85,7 +85,13 @@ def learned_reward(run: Run, options: DictConfig) -> tuple[LearnedReward, Advers
             RewardLoss(judges["action"]), demos, section.reward_steps, section.reward_lr
         )
     model, *rest = judges.values()
-    return LearnedReward(model, section.kind, goal_model=rest[0] if rest else None), adversary
+    reward = LearnedReward(
+        model,
+        section.kind,
+        form=section.form,
+        goal_model=rest[0] if rest else None,
+    )
+    return reward, adversary
 
 
 def chosen_starts(run: Run, options: DictConfig) -> InstructionSampler | StartingPairs:

@@ -24,8 +24,9 @@ def study(options: DictConfig) -> dict:
     content = write_result(options, results, "run study")
     folder = options.results
     if folder:
-        name = f"{options.task}-{options.demonstrations.n}-{options.network}-seed{options.seed}"
-        write_json(Path(folder) / f"{name}.json", content)
+        parts = [options.task, options.demonstrations.n, options.network, options.variant]
+        name = "-".join(str(part) for part in parts if part)
+        write_json(Path(folder) / f"{name}-seed{options.seed}.json", content)
     return results
 
 

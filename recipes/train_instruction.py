@@ -33,6 +33,7 @@ def train_instruction(options: DictConfig) -> dict:
         negatives=options.instruction.negatives,
         removal_rate=options.instruction.removal_rate,
         warmup=options.instruction.removal_warmup,
+        contrast=options.instruction.contrast,
     )
     calibrate = loss.calibrate if options.instruction.removal_rate == "estimated" else None
     buffer = first_frame_buffer(demos)

@@ -18,6 +18,7 @@ from train_reward import train_reward
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.files import write_json
 from ifo_grounding.report import provenance, results_table
+from ifo_grounding.training import Run
 from report import report
 
 
@@ -29,7 +30,10 @@ def two_phase(options: DictConfig) -> dict:
 
 
 def train_phases(options: DictConfig) -> None:
-    write_json(open_run(options) / "options.json", plain(options))
+    run = open_run(options)
+    if options.base:
+        run.take_over(Run(options.base))
+    write_json(run / "options.json", plain(options))
     # Phase 1: imitation from observation.
     collect(options)
     train_inverse(options)

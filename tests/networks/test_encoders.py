@@ -9,9 +9,7 @@ from ifo_grounding.networks import (
     ConvInstructionEncoder,
     GRUInstructionEncoder,
     PatchEncoder,
-    distinct_rows,
 )
-from ifo_grounding.networks import encoders as encoders_module
 
 
 def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) -> torch.Tensor:
@@ -110,18 +108,6 @@ def test_encoder_works_under_vmap(encoder):
     torch.testing.assert_close(
         torch.vmap(encoder)(tokens), encoder(tokens.flatten(0, 1)).reshape(2, 4, 32)
     )
-
-
-def test_distinct_rows_survive_hash_collisions(monkeypatch):
-    tokens = sentences(100)[torch.randint(100, (300,))]
-    expected = torch.unique(tokens, dim=0)
-    rows, inverse = distinct_rows(tokens)
-    assert torch.equal(rows[inverse], tokens)
-    assert len(rows) == len(expected)
-    monkeypatch.setattr(encoders_module, "_hash", lambda tokens: tokens.sum(-1) % 3)
-    rows, inverse = distinct_rows(tokens)
-    assert torch.equal(rows[inverse], tokens)
-    assert torch.equal(rows, expected)
 
 
 def test_conv_encoder_is_the_papers():

@@ -65,6 +65,7 @@ def test_nothing_scored_nothing_dropped():
         (POOL.float(), {}, "token ids"),
         (POOL, {"removal_rate": 1.0}, "removal_rate"),
         (POOL, {"negatives": 0}, "negatives"),
+        (POOL, {"contrast": -1.0}, "contrast"),
     ],
 )
 def test_impossible_negatives_are_refused(pool, options, message):

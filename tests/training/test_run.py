@@ -55,3 +55,21 @@ def test_an_unknown_logger_is_refused(tmp_path):
     with pytest.raises(UserError, match="unknown logger 'paper'"):
         Run(tmp_path, logger="paper")
     assert Run(tmp_path, logger="none").stage("a", {}).log() is None
+
+
+def test_a_run_takes_over_what_another_has_finished(tmp_path):
+    first = Run(tmp_path / "first")
+    first.stage("count", {"to": 3}).finish({"counted": 3})
+    (first / "logs").mkdir()
+    (first / "network.safetensors").write_bytes(b"weights")
+    second = Run(tmp_path / "second")
+    second.take_over(first)
+    assert second.stage("count", {"to": 3}).result == {"counted": 3}
+    assert second.stage("count", {"to": 4}).result is None
+    assert (second / "network.safetensors").read_bytes() == b"weights"
+    assert not (second / "logs").exists()
+    second.stage("count", {"to": 4}).finish({"counted": 4})
+    second.take_over(first)  # it has begun: nothing is overwritten
+    assert second.stage("count", {"to": 4}).result == {"counted": 4}
+    with pytest.raises(UserError, match="no finished stages"):
+        Run(tmp_path / "third").take_over(Run(tmp_path / "nowhere"))

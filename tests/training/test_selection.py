@@ -40,7 +40,7 @@ def test_each_start_counts_one_episode():
 
 def test_only_a_clear_gain_replaces_the_best_policy():
     layer = torch.nn.Linear(1, 1, bias=False)
-    best = BestPolicy(layer)
+    best = BestPolicy(layer, margin=2.0)
     assert best.consider(torch.zeros(100))
     first = layer.weight.clone()
     with torch.no_grad():
@@ -52,10 +52,26 @@ def test_only_a_clear_gain_replaces_the_best_policy():
     with torch.no_grad():
         layer.weight.add_(2)
     assert best.consider(torch.full((100,), 0.5))
-    other = BestPolicy(torch.nn.Linear(1, 1, bias=False))
+    other = BestPolicy(torch.nn.Linear(1, 1, bias=False), margin=2.0)
     other.load_state_dict(best.state_dict())
     other.restore()
     assert torch.equal(other.policy.weight, layer.weight)
+
+
+def test_practice_that_does_no_clear_harm_is_kept_under_the_one_standard_error_rule():
+    layer = torch.nn.Linear(1, 1, bias=False)
+    best = BestPolicy(layer, margin=-1.0)
+    returns = (torch.arange(100) < 90).float()
+    assert best.consider(returns)
+    with torch.no_grad():
+        layer.weight.add_(1)
+    slightly_worse = returns.clone()
+    slightly_worse[:2], slightly_worse[90:] = 0.0, torch.tensor([1.0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
+    assert best.consider(slightly_worse)
+    assert torch.equal(best.weights["weight"], layer.weight)
+    # What comes next is compared with the highest returns, so that small losses do not add up.
+    assert torch.equal(best.returns, returns)
+    assert not best.consider((torch.arange(100) < 80).float())
 
 
 def test_a_run_that_only_gets_worse_ends_with_the_policy_of_phase_1():

@@ -118,19 +118,22 @@ class Suitability(nn.Module):
         self.dropout = nn.Dropout(0.9)
         self.encoded = 0
 
-    def encode_pixels(self, pixels):
+    def encode_scenes(self, pixels):
         return shown(pixels).float().unsqueeze(-1)
 
     def encode_instruction(self, instruction):
         self.encoded += len(instruction)
         return (instruction[..., :1] - 1).float() * self.sharpness
 
-    def score(self, pixels, instruction):
-        above = instruction / self.sharpness - pixels > 0.5
+    def score_candidates(self, scenes, words, index):
+        return self.score(scenes.expand_as(index), words[index].squeeze(-1))
+
+    def score(self, number, target):
+        above = target / self.sharpness - number > 0.5
         return self.dropout(self.sharpness * (2.0 * above - 1))
 
     def forward(self, pixels, instruction):
-        return self.score(self.encode_pixels(pixels), self.encode_instruction(instruction))
+        return self.score(self.encode_scenes(pixels), self.encode_instruction(instruction))
 
 
 class Whole(nn.Module):

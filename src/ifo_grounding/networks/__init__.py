@@ -8,7 +8,6 @@ from ifo_grounding.networks.encoders import (
     GRUInstructionEncoder,
     InstructionEncoder,
     PatchEncoder,
-    distinct_rows,
 )
 from ifo_grounding.networks.fusion import (
     CellCount,
@@ -47,7 +46,6 @@ __all__ = [
     "Shapes",
     "SpatialReadout",
     "ValueNetwork",
-    "distinct_rows",
     "load",
     "make_goal_judge",
     "make_instruction_classifier",

@@ -9,7 +9,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up
+
+WORD = 8
+"""Pixels that are compared at once."""
 
 
 def as_float(pixels: Tensor) -> Tensor:
@@ -67,12 +72,33 @@ class PatchEncoder(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w], channels last in memory."""
-        below, right = (-size % self.patch for size in image.shape[-2:])
-        if below or right:
-            image = F.pad(image, (0, right, 0, below))
-        cells = image.unflatten(-1, (-1, self.patch)).unflatten(-3, (-1, self.patch))
-        patches = cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
+        patches = self._patches(self._padded(image), self.patch)
         return self.embed(as_float(patches)).permute(0, 3, 1, 2)
+
+    def cells(self, image: Tensor) -> Cells | None:
+        """Map an image [N, C, H, W] to its distinct cells; None where that would not pay.
+
+        It pays on a CPU, for images of bytes in which more than half of the patches repeat.
+        """
+        plain = image.dtype == torch.uint8 and image.device.type == "cpu"
+        if not plain or self.patch % WORD or hidden_from_python(image):
+            return None
+        words = self._padded(image).contiguous().view(torch.int64)
+        patches = self._patches(words, self.patch // WORD)
+        rows, index = distinct_rows(patches.flatten(0, 2))
+        if 2 * len(rows) > len(index):
+            return None
+        features = self.embed(as_float(rows.view(torch.uint8)))
+        return Cells(features, index.view(patches.shape[:3]).flatten(1))
+
+    def _patches(self, image: Tensor, width: int) -> Tensor:
+        """Cut [N, C, H, W] into [N, h, w, C * patch * width]."""
+        cells = image.unflatten(-1, (-1, width)).unflatten(-3, (-1, self.patch))
+        return cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
+
+    def _padded(self, image: Tensor) -> Tensor:
+        below, right = (-size % self.patch for size in image.shape[-2:])
+        return F.pad(image, (0, right, 0, below)) if below or right else image
 
     @staticmethod
     def grid(height: int, width: int, patch: int) -> tuple[int, int]:
@@ -98,12 +124,19 @@ class InstructionEncoder(nn.Module):
         Raises:
             UserError: where an id lies outside the vocabulary.
         """
-        tokens = tokens.long()
-        if _under_vmap(tokens):
-            return self._encode(tokens)
-        distinct, inverse = distinct_rows(tokens)
-        if distinct.numel() == 0:
-            return self.embedding.weight.new_zeros(len(tokens), self.size)
+        if hidden_from_python(tokens):
+            return self._encode(tokens.long())
+        return look_up(*self.distinct(tokens))
+
+    def distinct(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Encode the distinct instructions of [N, L]: features [U, 2 * hidden], and which is whose.
+
+        Raises:
+            UserError: where an id lies outside the vocabulary.
+        """
+        distinct, inverse = distinct_rows(tokens.long())
+        if not distinct.numel():
+            return self.embedding.weight.new_zeros(len(distinct), self.size), inverse
         words = self.embedding.num_embeddings
         lowest, highest = distinct.aminmax()
         if lowest < 0 or highest >= words:
@@ -112,7 +145,7 @@ class InstructionEncoder(nn.Module):
                 f"network knows 0 to {words - 1}: build it with the vocabulary of the data"
             )
         longest = max(int(_lengths(distinct).max()), 1)
-        return F.embedding(inverse, self._encode(distinct[:, :longest]))
+        return self._encode(distinct[:, :longest]), inverse
 
     def _encode(self, tokens: Tensor) -> Tensor:
         raise NotImplementedError
@@ -137,10 +170,18 @@ class ConvInstructionEncoder(InstructionEncoder):
     def _encode(self, tokens: Tensor) -> Tensor:
         """Encode rows of ids [N, L], of which trailing zeros do not count."""
         step = torch.arange(tokens.shape[1], device=tokens.device)
-        alive = (step < _lengths(tokens).unsqueeze(1)).unsqueeze(1)
-        words = self.embedding(tokens).transpose(1, 2) * alive
-        words = F.relu(self.first(words)) * alive
-        return self.out((F.relu(self.second(words)) * alive).amax(-1))
+        alive = (step < _lengths(tokens).unsqueeze(1)).unsqueeze(-1)
+        words = self.embedding(tokens) * alive
+        words = F.relu(_over_words(self.first, words)) * alive
+        return self.out((F.relu(_over_words(self.second, words)) * alive).amax(-2))
+
+
+def _over_words(layer: nn.Conv1d, words: Tensor) -> Tensor:
+    """Convolve [N, L, D] over its words, as an image of one row: on a CPU nearly twice as fast."""
+    row = words.movedim(-1, -2).unsqueeze(-2)  # [N, D, 1, L], channels last in memory
+    padding = (0, layer.kernel_size[0] // 2)
+    out = F.conv2d(row, layer.weight.unsqueeze(2), layer.bias, padding=padding)
+    return out.squeeze(-2).movedim(-2, -1)
 
 
 class GRUInstructionEncoder(InstructionEncoder):
@@ -192,38 +233,7 @@ class GRUInstructionEncoder(InstructionEncoder):
         return torch.lerp(candidate, state, keep)
 
 
-def distinct_rows(tokens: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the distinct rows of ``tokens`` [N, L] and, for each row, which of them it is.
-
-    Rows are told apart by a 64-bit hash, which is verified; a collision falls back to comparing
-    rows, which takes thirty times as long.
-
-    >>> rows, inverse = distinct_rows(torch.tensor([[1, 2], [3, 4], [1, 2]]))
-    >>> rows[inverse].tolist()
-    [[1, 2], [3, 4], [1, 2]]
-    """
-    hashes = _hash(tokens)
-    values, inverse = torch.unique(hashes, return_inverse=True)
-    numbers = torch.arange(len(tokens), device=tokens.device)
-    first = numbers.new_zeros(len(values)).scatter_(0, inverse, numbers)
-    rows = tokens[first]
-    if torch.equal(rows[inverse], tokens):
-        return rows, inverse
-    return torch.unique(tokens, dim=0, return_inverse=True)
-
-
-def _hash(tokens: Tensor) -> Tensor:
-    """Hash rows of ids [N, L] to 64 bits: a polynomial in a large odd number, modulo 2^64."""
-    factors = [pow(6364136223846793005, power + 1, 2**63) for power in range(tokens.shape[1])]
-    return (tokens * torch.tensor(factors, device=tokens.device)).sum(-1)
-
-
 def _lengths(tokens: Tensor) -> Tensor:
     """Return the number of ids of each row up to the last that is not padding."""
     place = torch.arange(1, tokens.shape[-1] + 1, device=tokens.device)
     return torch.where(tokens != 0, place, 0).amax(-1)
-
-
-def _under_vmap(tensor: Tensor) -> bool:
-    """Whether ``torch.vmap`` hides a batch in ``tensor``, so that no shape may depend on it."""
-    return torch._C._functorch.is_batchedtensor(tensor)

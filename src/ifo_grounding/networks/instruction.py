@@ -20,6 +20,7 @@ from ifo_grounding.networks.building import (
     construct,
     wrap,
 )
+from ifo_grounding.networks.cells import Cells, hidden_from_python
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.fusion import (
     CellCount,
@@ -32,12 +33,17 @@ from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.transfer import copy_weights, trunk_of
 from ifo_grounding.networks.trunk import (
     Network,
+    cells_are_alone,
+    distinct_cells,
+    distinct_instructions,
     encode_instruction,
     flatten_cells,
+    fuse_pairs,
     grid,
     head,
     image_encoder,
     instruction_encoder,
+    read_pairs,
     same_batch,
 )
 
@@ -59,6 +65,7 @@ class PairScorer(Network):
         self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
         self.instruction = instruction_encoder(shapes, config)
         self.strong = config.preset == "strong"
+        self.alone = cells_are_alone(config)
         size = self.instruction.size
         if self.strong:
             self.fusion = nn.ModuleList(
@@ -89,6 +96,43 @@ class PairScorer(Network):
     def encode_instruction(self, instruction: Tensor) -> Tensor:
         """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
         return encode_instruction(self.instruction, instruction)
+
+    def encode_scenes(self, *pixels: Tensor) -> Cells | Tensor:
+        """Encode images, each [N, C, H, W], for :meth:`score_candidates`.
+
+        Returns:
+            Their distinct cells where these repeat, else features [N, F, h, w].
+        """
+        if self.alone:
+            flat = [self.flat_pixels(image)[0] for image in pixels]
+            with self.autocast(pixels[0]):
+                cells = distinct_cells(self.image, torch.cat(flat, -3))
+            if cells is not None:
+                return cells
+        return self.encode_pixels(*pixels)
+
+    def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:
+        """Score some instructions of a pool for each scene.
+
+        Args:
+            scenes: N encoded scenes, from :meth:`encode_scenes`.
+            words: encoded instructions [P, D], from :meth:`encode_instruction`.
+            index: candidates of each scene, int64 [N, K].
+
+        Returns:
+            Logits, float32 [N, K].
+        """
+        rows, count = index.shape
+        which = index.flatten()
+        if not isinstance(scenes, Cells):
+            repeated = scenes.unsqueeze(1).expand(-1, count, *scenes.shape[1:]).flatten(0, 1)
+            return self.score(repeated, words[which]).reshape(rows, count)
+        with self.autocast(words):
+            places = scenes.index.repeat_interleave(count, 0)
+            fused, lying = fuse_pairs(self.fusion, Cells(scenes.features, places), words, which)
+            seen = [read_pairs(part, fused, lying) for part in (self.readout, self.count)]
+            outputs = self.head(torch.cat(seen, -1))
+        return outputs.float().reshape(rows, count) + self.prior
 
     def score(self, features: Tensor, instruction: Tensor) -> Tensor:
         """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""
@@ -127,6 +171,14 @@ class PairScorer(Network):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Score images, each [*B, C, H, W], with token ids [*B, L], the last input."""
         *pixels, instruction = inputs
+        if self.alone and not hidden_from_python(instruction):
+            flat = [self.flat_pixels(image) for image in pixels]
+            batch = instruction.shape[:-1]
+            same_batch(**{f"image {n}": size for n, (_, size) in enumerate(flat)}, words=batch)
+            tokens = instruction.reshape(-1, instruction.shape[-1])
+            words, which = distinct_instructions(self.instruction, tokens)
+            scenes = self.encode_scenes(*(image for image, _ in flat))
+            return self.score_candidates(scenes, words, which.unsqueeze(1)).reshape(*batch, 1)
         return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))
 
 

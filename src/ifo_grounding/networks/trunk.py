@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up, pair_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     ConvEncoder,
@@ -21,6 +22,7 @@ from ifo_grounding.networks.encoders import (
     PatchEncoder,
 )
 from ifo_grounding.networks.fusion import (
+    CellCount,
     GatedAttention,
     ResidualBlock,
     ResidualFiLM,
@@ -89,6 +91,50 @@ def encode_instruction(encoder: InstructionEncoder, tokens: Tensor) -> Tensor:
     return flat.reshape(*tokens.shape[:-1], encoder.size)
 
 
+def distinct_cells(encoder: nn.Module, image: Tensor) -> Cells | None:
+    """Encode the distinct cells of [N, C, H, W]; None where there are none, or it does not pay."""
+    return encoder.cells(image) if isinstance(encoder, PatchEncoder) else None
+
+
+def distinct_instructions(encoder: InstructionEncoder, tokens: Tensor) -> tuple[Tensor, Tensor]:
+    """Encode the distinct instructions of [N, L]: float32 [P, D], and which each row has."""
+    with torch.autocast(tokens.device.type, enabled=False):
+        return encoder.distinct(tokens)
+
+
+def fuse_pairs(
+    fusion: nn.ModuleList, cells: Cells, words: Tensor, which: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Fuse every distinct pair of a cell and an instruction, where no cell sees another.
+
+    Args:
+        fusion: blocks of :class:`~ifo_grounding.networks.ResidualFiLM` of kernel 1.
+        cells: of R rows.
+        words: encoded instructions [P, D].
+        which: the instruction of each row, int64 [R].
+
+    Returns:
+        Fused features of each pair, as images of one cell, [Q, F, 1, 1], and the pair in each
+        cell of each row, int64 [R, h * w].
+    """
+    pairs = pair_up(cells.index, which, len(cells.features), len(words))
+    fused = look_up(cells.features, pairs.cell)[..., None, None]
+    for block in fusion:
+        assert isinstance(block, ResidualFiLM)
+        fused = block.modulate(fused, look_up(block.film(words), pairs.instruction))
+    return F.relu(fused), pairs.index
+
+
+def read_pairs(part: SpatialReadout | CellCount, fused: Tensor, index: Tensor) -> Tensor:
+    """Read fused pairs [Q, F, 1, 1] where ``index`` [R, h * w] says that they lie: [R, size]."""
+    return part.read(look_up(part.outlook(fused).flatten(1), index))
+
+
+def cells_are_alone(config: NetworkConfig) -> bool:
+    """Whether no cell of a trunk of this configuration sees another."""
+    return config.preset == "strong" and config.kernel == 1 and config.context == 0
+
+
 def image_encoder(shapes: Shapes, config: NetworkConfig, images: int = 1) -> nn.Module:
     """Return the preset's encoder of ``images`` images laid on top of each other."""
     channels = images * shapes.image_shape[0]
@@ -141,6 +187,7 @@ class Trunk(nn.Module):
         size, features = self.instruction.size, config.features
         self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
         self.readout: SpatialReadout | None = None
+        self.alone = cells_are_alone(config)
         if config.preset == "paper":
             self.fusion = nn.ModuleList([GatedAttention(size, features)])
             self.size = features * math.prod(grid(shapes, config))
@@ -163,8 +210,14 @@ class Trunk(nn.Module):
 
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
-        features = self.fuse(image, tokens)
-        return flatten_cells(features) if self.readout is None else self.readout(features)
+        if self.readout is None:
+            return flatten_cells(self.fuse(image, tokens))
+        if self.alone and not hidden_from_python(tokens):
+            cells = distinct_cells(self.image, image)
+            if cells is not None:
+                words, which = distinct_instructions(self.instruction, tokens)
+                return read_pairs(self.readout, *fuse_pairs(self.fusion, cells, words, which))
+        return self.readout(self.fuse(image, tokens))
 
 
 class InstructedNetwork(Network):

@@ -35,6 +35,11 @@ class InstructionLoss(SupervisedLoss):
     Positives and negatives weigh the same, whatever their numbers. Writes ``loss_instruction``,
     ``positive_probability``, ``negative_probability`` and ``removed``, a share.
 
+    ``contrast`` adds the cross entropy of finding a scene's own instruction among its negatives
+    (InfoNCE, van den Oord et al. 2018). In large pools nearly all negatives name things that the
+    scene lacks, and are soon told apart; what little is left of the binary loss says hardly anything
+    of the rest, while the contrast is made of it. An extension of the paper.
+
     With the 12 instructions of ``move`` some 4 of 11 negatives suit the scene, and without removal
     the best possible classifier says 0.69 where the paper's threshold is 0.8. In large pools false
     negatives are rare. So the share to remove is estimated, unless it is given.
@@ -46,6 +51,7 @@ class InstructionLoss(SupervisedLoss):
         removal_rate: share of a batch's negatives to remove, those scored highest; with
             ``"estimated"``, as large as their scores say that the share of suitable ones is.
         warmup: share of training before which none is removed; see :meth:`set_progress`.
+        contrast: weight of the contrast, in nats.
         generator: where random numbers come from; None is the global generator.
 
     Raises:
@@ -81,11 +87,15 @@ class InstructionLoss(SupervisedLoss):
         negatives: int = 8,
         removal_rate: float | str = ESTIMATED,
         warmup: float = 1 / 3,
+        contrast: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
         if negatives < 1:
             raise UserError(f"negatives must be at least 1, got {negatives}")
+        if contrast < 0:
+            raise UserError(f"contrast is a weight of at least 0, got {contrast}")
+        self.contrast = contrast
         self.count = negatives
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator)
 
@@ -126,6 +136,9 @@ class InstructionLoss(SupervisedLoss):
         self.negatives.watch(own, other)
         kept = self.negatives.keep(other)
         loss = (F.softplus(-own).mean() + masked_mean(F.softplus(other), kept)) / 2
+        if self.contrast:
+            logits = torch.cat([own.unsqueeze(1), other.masked_fill(~kept, -torch.inf)], 1)
+            loss = loss + self.contrast * (logits.logsumexp(1) - own).mean()
         return scalars(
             loss_instruction=loss,
             positive_probability=self._mean(own.sigmoid()),

@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
 from ifo_grounding.objectives.mixture import MixtureEstimate
 
@@ -106,8 +107,8 @@ def pair_scores(
 ) -> tuple[Tensor, Tensor]:
     """Score each row's own instruction and others: logits [N] and [N, K].
 
-    A network with ``encode_pixels``, ``encode_instruction`` and ``score`` encodes each row's
-    images and each distinct instruction once; any other runs once per pair.
+    A network with ``encode_scenes``, ``encode_instruction`` and ``score_candidates`` encodes each
+    row's images and each distinct instruction once; any other runs once per pair.
 
     Args:
         network: images and an instruction, its last input, to a logit [*B, 1].
@@ -117,11 +118,14 @@ def pair_scores(
     *pixel_keys, instruction_key = network.in_keys
     both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
     count = both.shape[1]
-    if all(hasattr(network, name) for name in ("encode_pixels", "encode_instruction", "score")):
-        features = network.encode_pixels(*(batch.get(key) for key in pixel_keys))
-        words = network.encode_instruction(both.flatten(0, 1))
-        repeated = features.unsqueeze(1).expand(-1, count, *features.shape[1:]).flatten(0, 1)
-        scores = network.score(repeated, words)
+    parts = ("encode_scenes", "encode_instruction", "score_candidates")
+    if all(hasattr(network, name) for name in parts):
+        tokens, which = distinct_rows(both.flatten(0, 1).long())
+        scores = network.score_candidates(
+            network.encode_scenes(*(batch.get(key) for key in pixel_keys)),
+            network.encode_instruction(tokens),
+            which.view(-1, count),
+        )
     else:
         rows = torch.arange(len(both), device=both.device).repeat_interleave(count)
         pairs = batch.select(*pixel_keys)[rows].set(instruction_key, both.flatten(0, 1))

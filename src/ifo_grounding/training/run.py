@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -57,6 +58,25 @@ class Run:
         if not path.exists():
             raise UserError(f"{path} is missing: run the recipe {recipe} with the same run first")
         return path
+
+    def take_over(self, other: Run) -> None:
+        """Copy what another run has made, unless this one has begun.
+
+        Its finished stages count as done here, as long as their settings are the same. A phase 2
+        can so be repeated with other options, from the same phase 1.
+
+        Raises:
+            UserError: where the other run does not exist.
+        """
+        if self.folder.exists():
+            return
+        if not (other.folder / "stages").is_dir():
+            raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
+        passing = shutil.ignore_patterns("logs", "checkpoints", "result.json", "options.json")
+        copy = self.folder.with_name(f"{self.folder.name}.copying")
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(other.folder, copy, ignore=passing)
+        copy.rename(self.folder)
 
     def stage(self, name: str, settings: Any, needs: Sequence[str] = ()) -> Stage:
         """Return a stage, done only if its settings and all that it needs are as they were."""

@@ -18,9 +18,6 @@ from ifo_grounding.seeding import derive
 from ifo_grounding.training.environment import reseed, sampler_stats, transforms_of
 from ifo_grounding.training.supervised import Metrics
 
-STANDARD_ERRORS = 2.0
-"""How clearly a policy has to be better than the best one so far."""
-
 
 @torch.no_grad()
 def learned_returns(env: EnvBase, policy: nn.Module, episodes: int, max_steps: int) -> Tensor:
@@ -62,32 +59,34 @@ def _batch_returns(env: EnvBase, policy: nn.Module, max_steps: int) -> Tensor:
 
 
 class BestPolicy:
-    """Remembers the weights with the highest learned return on the same starts.
+    """Remembers weights with a high learned return on the same starts.
 
-    A policy takes the place of the best one if its mean return is higher by more than two standard
-    errors of the paired difference, so that noise alone seldom replaces what phase 1 has learned.
+    A policy is kept if its mean return is higher than the highest one so far by more than
+    ``margin`` standard errors of the paired difference. With 2, noise alone seldom replaces what
+    phase 1 has learned. With -1, practice goes on unless it clearly harms (the one-standard-error
+    rule, Breiman et al. 1984): near the ceiling most gains are too small to be clear.
 
     >>> layer = nn.Linear(1, 1, bias=False)
-    >>> best = BestPolicy(layer)
+    >>> best = BestPolicy(layer, margin=2.0)
     >>> best.consider(torch.tensor([0.0, 1.0])), best.consider(torch.tensor([1.0, 0.0]))
     (True, False)
     >>> best.consider(torch.tensor([1.0, 1.5]))
     True
     """
 
-    def __init__(self, policy: nn.Module) -> None:
-        self.policy = policy
+    def __init__(self, policy: nn.Module, margin: float) -> None:
+        self.policy, self.margin = policy, margin
         self.weights: dict[str, Tensor] = {}
         self.returns: Tensor | None = None
 
     def consider(self, returns: Tensor) -> bool:
-        """Keep the policy's present weights if their returns [N] are clearly higher."""
-        if self.returns is not None:
-            gain = returns - self.returns
-            error = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
-            if float(gain.mean()) <= STANDARD_ERRORS * error:
-                return False
-        self.returns = returns.clone()
+        """Keep the policy's present weights if their returns [N] are high enough."""
+        gain = torch.ones(1) if self.returns is None else returns - self.returns
+        error = float(gain.std()) / math.sqrt(len(gain)) if len(gain) > 1 else 0.0
+        if float(gain.mean()) <= self.margin * error:
+            return False
+        if float(gain.mean()) > 0:
+            self.returns = returns.clone()
         self.weights = copy.deepcopy(self.policy.state_dict())
         return True
 
@@ -117,6 +116,8 @@ class SelectionSchedule:
     """Episodes of each look."""
     max_steps: int
     """Most actions of an episode."""
+    margin: float
+    """Of :class:`BestPolicy`."""
 
 
 class Selection:
@@ -130,7 +131,7 @@ class Selection:
         seed: int,
     ) -> None:
         self.env, self.policy, self.schedule, self.seed = env, policy, schedule, seed
-        self.best = BestPolicy(policy)
+        self.best = BestPolicy(policy, schedule.margin)
         self.fixed = [t for t in transforms_of(env) if getattr(t, "fixes_scenes", False)]
         self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
 

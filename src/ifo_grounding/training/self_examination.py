@@ -50,6 +50,8 @@ class SelfExaminationConfig:
     """Learning rate of the policy (paper: 3e-5)."""
     value_lr: float = 8e-4
     """Learning rate of the value head."""
+    anneal: bool = False
+    """Lower both learning rates linearly, to nothing after the last iteration."""
     gamma: float = 0.99
     """Discount; 0 credits each action with its own reward alone."""
     lmbda: float = 0.95
@@ -71,6 +73,9 @@ class SelfExaminationConfig:
     select_every: int = 0
     """Iterations between two looks at the greedy policy's learned return. In the end the best
     policy is kept, which may be phase 1's; 0 keeps the last one."""
+    select_margin: float = 2.0
+    """Standard errors by which a policy has to be better than the best one to be kept: 2 keeps
+    clear gains alone, -1 keeps all practice that does no clear harm."""
     select_episodes: int = 512
     """Episodes of each look, always from the same starts."""
     max_steps: int = 40
@@ -131,7 +136,11 @@ def self_examine(
     learner = _Learner(env, policy, value, config)
     sampler_stats(env)  # forgets the reset that a collector begins with
     schedule = SelectionSchedule(
-        config.select_every, config.iterations, config.select_episodes, config.max_steps
+        config.select_every,
+        config.iterations,
+        config.select_episodes,
+        config.max_steps,
+        config.select_margin,
     )
     selection = Selection(env, policy, schedule, seed)
     parts: dict[str, Any] = {
@@ -167,7 +176,7 @@ def self_examine(
             batch = learner.collect()
             metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
             metrics |= sampler_stats(env)
-            metrics |= learner.improve(batch, train_policy=iteration >= config.value_warmup)
+            metrics |= learner.improve(batch, iteration)
             if adversary:
                 metrics |= adversary(batch)
             done = iteration + 1
@@ -242,13 +251,17 @@ class _Learner:
         reward = batch[keys.NEXT, keys.LEARNED_REWARD]
         batch[keys.NEXT, keys.LEARNED_REWARD] = reward - charge
 
-    def improve(self, batch: TensorDictBase, train_policy: bool) -> Metrics:
+    def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""
         config = self.config
         with torch.no_grad():
             self.advantage(batch)
-        self.optimizer.param_groups[0]["lr"] = config.lr if train_policy else 0.0
-        steps = batch.reshape(-1)
+        scale = 1 - iteration / config.iterations if config.anneal else 1.0
+        trained = iteration >= config.value_warmup
+        self.optimizer.param_groups[0]["lr"] = scale * config.lr if trained else 0.0
+        self.optimizer.param_groups[1]["lr"] = scale * config.value_lr
+        # What comes next is in the advantage already; copying its images would cost a tenth.
+        steps = batch.exclude(keys.NEXT, keys.INITIAL_PIXELS).reshape(-1)
         epochs = config.epochs if config.algorithm == "ppo" else 1
         sums: dict[str, Tensor] = {}
         updates = 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast
 
 import torch
 from tensordict import TensorDict, unravel_key
@@ -32,22 +32,30 @@ class Choices(NamedTuple):
     """Its probability of being suitable, float32 [B]; the best one seen where there is none."""
 
 
+class Scenes(Protocol):
+    """Encoded states, of which rows can be taken: a tensor, for example."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, rows: Any) -> Any: ...
+
+
 class SplitClassifier(Protocol):
     """A classifier that encodes states and instructions separately."""
 
-    def encode_pixels(self, pixels: Tensor) -> Tensor: ...  # noqa: D102
+    def encode_scenes(self, *pixels: Tensor) -> Scenes: ...  # noqa: D102
 
     def encode_instruction(self, instruction: Tensor) -> Tensor: ...  # noqa: D102
 
-    def score(self, pixels: Tensor, instruction: Tensor) -> Tensor: ...  # noqa: D102
+    def score_candidates(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor: ...  # noqa: D102
 
 
 class PoolScorer:
     """Scores pairs of a state and an instruction of a pool.
 
-    Where the classifier's network has ``encode_pixels``, ``encode_instruction`` and ``score``, each
-    state and each instruction is encoded once: encodings of the pool are kept until a weight
-    changes. Any other TensorDictModule is called on whole pairs.
+    Where the classifier's network has ``encode_scenes``, ``encode_instruction`` and
+    ``score_candidates``, each state and each instruction is encoded once: encodings of the pool are
+    kept until a weight changes. Any other TensorDictModule is called on whole pairs.
 
     Args:
         classifier: TensorDictModule from (pixels, instruction) to one logit.
@@ -79,49 +87,50 @@ class PoolScorer:
         if not isinstance(self.classifier, TensorDictModule):
             return None
         network = self.classifier.module
-        parts = ("encode_pixels", "encode_instruction", "score")
+        parts = ("encode_scenes", "encode_instruction", "score_candidates")
         split = all(callable(getattr(network, part, None)) for part in parts)
         return cast(SplitClassifier, network) if split else None
 
-    def encode(self, pixels: Tensor) -> Tensor:
+    def encode(self, pixels: Tensor) -> Scenes:
         """Encode states [B, ...] for :meth:`score`, or return them where nothing is split."""
-        if (network := self.network) is None:
-            return pixels
         device = device_of(self.classifier) or pixels.device
+        if (network := self.network) is None:
+            return pixels.to(device)
         with evaluating(self.classifier):
-            return torch.cat([network.encode_pixels(p.to(device)) for p in pixels.split(AT_ONCE)])
+            return network.encode_scenes(pixels.to(device))
 
-    def score(self, states: Tensor, index: Tensor) -> Tensor:
+    def score(self, states: Scenes, index: Tensor) -> Tensor:
         """Score candidates.
 
         Args:
-            states: encoded states [B, ...], from :meth:`encode`.
+            states: B encoded states, from :meth:`encode`.
             index: candidates of each state in the pool, int64 [B, K].
 
         Returns:
             Logits, float32 [B, K] on the device of ``index``.
         """
         self.scored += index.numel()
-        device = device_of(self.classifier) or states.device
+        device = device_of(self.classifier) or index.device
         rows = max(1, AT_ONCE // max(1, index.shape[1]))
         with evaluating(self.classifier):
             parts = [
-                self._pairs(some.to(device), candidates.to(device))
-                for some, candidates in zip(states.split(rows), index.split(rows), strict=True)
+                self._candidates(
+                    states[begin : begin + rows], index[begin : begin + rows].to(device)
+                )
+                for begin in range(0, len(index), rows)
             ]
         return torch.cat(parts).to(index.device)
 
-    def _pairs(self, states: Tensor, index: Tensor) -> Tensor:
-        rows, candidates = index.shape
-        paired = states.repeat_interleave(candidates, 0)
+    def _candidates(self, states: Any, index: Tensor) -> Tensor:
         if (network := self.network) is not None:
-            logit = network.score(paired, self.encodings(network, states.device)[index.flatten()])
+            words = self.encodings(network, index.device)
+            logit = network.score_candidates(states, words, index)
         else:
-            batch = TensorDict({}, batch_size=[len(paired)], device=states.device)
-            batch[self.pixels_key] = paired
-            batch[self.instruction_key] = self.pool.to(states.device)[index.flatten()]
-            logit = self.classifier(batch).get(self.logit_key)
-        return flat_logit(logit, len(paired), self.logit_key).view(rows, candidates)
+            pairs = TensorDict({}, batch_size=[index.numel()], device=index.device)
+            pairs[self.pixels_key] = states.repeat_interleave(index.shape[1], 0)
+            pairs[self.instruction_key] = self.pool.to(index.device)[index.flatten()]
+            logit = self.classifier(pairs).get(self.logit_key)
+        return flat_logit(logit, index.numel(), self.logit_key).view(index.shape)
 
     def encodings(self, network: SplitClassifier, device: torch.device) -> Tensor:
         """Encode the pool, or return what was kept if no weight has changed since."""
@@ -220,7 +229,11 @@ def choose_instructions(
     index = draw_candidates(len(pixels), len(scorer.pool), candidates, generator)
     index = index.to(pixels.device)
     limit = math.log(threshold / (1 - threshold)) if threshold else -math.inf
-    return _search(scorer, pixels, index, limit, best=choose == "best")
+    parts = [
+        _search(scorer, some, candidates, limit, best=choose == "best")
+        for some, candidates in zip(pixels.split(AT_ONCE), index.split(AT_ONCE), strict=True)
+    ]
+    return Choices(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 
 def _search(scorer: PoolScorer, pixels: Tensor, index: Tensor, limit: float, best: bool) -> Choices:
@@ -234,10 +247,11 @@ def _search(scorer: PoolScorer, pixels: Tensor, index: Tensor, limit: float, bes
     score = torch.full((len(pixels),), -math.inf, device=pixels.device)
     waiting = torch.arange(len(pixels), device=pixels.device)
     states = scorer.encode(pixels) if len(pixels) else pixels
+    home = device_of(scorer.classifier) or pixels.device
     begin = 0
     while len(waiting) and begin < index.shape[1]:
         candidates = index[waiting, begin : begin + look]
-        logits = scorer.score(states[waiting.to(states.device)], candidates)
+        logits = scorer.score(states[waiting.to(home)], candidates)
         suitable = logits > limit
         found = suitable.any(1)
         place = logits.argmax(1)

@@ -1,0 +1,30 @@
+import torch
+
+from ifo_grounding import distinct
+from ifo_grounding.distinct import distinct_rows
+
+
+def test_rows_are_told_apart_even_where_hashes_collide(monkeypatch):
+    source = torch.Generator().manual_seed(0)
+    rows = torch.randint(40, (100, 16), generator=source)[
+        torch.randint(100, (300,), generator=source)
+    ]
+    expected = torch.unique(rows, dim=0)
+    found, index = distinct_rows(rows)
+    assert torch.equal(found[index], rows)
+    assert len(found) == len(expected)
+    monkeypatch.setattr(distinct, "_hash", lambda rows: rows.sum(-1) % 3)
+    found, index = distinct_rows(rows)
+    assert torch.equal(found[index], rows)
+    assert torch.equal(found, expected)
+
+
+def test_rows_that_mirror_each_other_do_not_collide():
+    a, b = 0x0123456789ABCDEF, 0x7EDCBA9876543210
+    rows = torch.tensor([[a, b, b, a], [b, a, a, b], [a, a, b, b], [b, b, a, a]])
+    assert distinct._hash(rows).unique().numel() == 4
+
+
+def test_no_rows():
+    rows, index = distinct_rows(torch.zeros(0, 5, dtype=torch.int64))
+    assert rows.shape == (0, 5) and index.shape == (0,)
