@@ -37,8 +37,8 @@ class InstructionLoss(SupervisedLoss):
 
     ``contrast`` adds the cross entropy of finding a scene's own instruction among its negatives
     (InfoNCE, van den Oord et al. 2018). In large pools nearly all negatives name things that the
-    scene lacks, and are soon told apart; what little is left of the binary loss says hardly anything
-    of the rest, while the contrast is made of it. An extension of the paper.
+    scene lacks, and are soon told apart; what is then left of the binary loss says hardly anything
+    of the others, while the contrast is made of them. An extension of the paper.
 
     With the 12 instructions of ``move`` some 4 of 11 negatives suit the scene, and without removal
     the best possible classifier says 0.69 where the paper's threshold is 0.8. In large pools false
