@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -79,9 +80,8 @@ def simulator(options: DictConfig, num_envs: int = 1, **kwargs: Any) -> PickAndP
 
 def build(make: Callable[..., Any], options: DictConfig, **kwargs: Any) -> Any:
     """Build a network for the simulator's images, words and actions."""
-    return make(
-        simulator(options), options.network, seed=options.seed, device=options.device, **kwargs
-    )
+    chosen = {"seed": options.seed, "device": options.device, **kwargs}
+    return make(simulator(options), options.network, **chosen)
 
 
 def load_network(run: Run, name: str, recipe: str, options: DictConfig) -> Any:
@@ -108,6 +108,7 @@ def train(
     file: str,
     held_out: HeldOut | None = None,
     finish: Callable[[], Any] | None = None,
+    checkpoint: Path | None = None,
     **found: float,
 ) -> dict:
     """Fit a network to a buffer, do what is left to do, save it, and finish with what was found."""
@@ -117,7 +118,7 @@ def train(
         fit_config(options[section]),
         seed=options.seed,
         name=stage.name,
-        checkpoint=stage.checkpoint,
+        checkpoint=checkpoint or stage.checkpoint,
         checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
         held_out=held_out,

@@ -1,6 +1,17 @@
 """Imitate the labelled demonstrations: phase 1, which is BCO (paper, 1st-phase)."""
 
-from _shared import POLICIES, build, load_demonstrations, load_labels, open_stage, train
+import math
+
+from _shared import (
+    POLICIES,
+    build,
+    fit_config,
+    load_demonstrations,
+    load_labels,
+    open_stage,
+    shows_progress,
+    train,
+)
 from omegaconf import DictConfig
 from torchrl.data import ReplayBuffer
 
@@ -8,18 +19,66 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import labelled_buffer
 from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.training import HeldOut
-from ifo_grounding.training.run import Run
+from ifo_grounding.seeding import derive
+from ifo_grounding.training import HeldOut, Run, Stage, fit
 
 
 def imitate(options: DictConfig) -> dict:
     stage = open_stage(options, "imitate", ["imitate"], needs=["label"])
     if stage.result is not None:
         return stage.result
-    loss = ImitationLoss(build(make_policy, options))
     seen, held_out = labelled_demonstrations(stage.run, options.imitate.held_out)
-    validation = HeldOut(loss, held_out) if held_out is not None else None
-    return train(options, stage, loss, seen, "imitate", POLICIES[0], held_out=validation)
+    count = options.imitate.trials
+    beginnings = [Beginning(options, stage, seen, held_out, n) for n in range(count)]
+    best = min(beginnings, key=lambda beginning: beginning.try_out())
+    return train(
+        options,
+        stage,
+        best.loss,
+        seen,
+        "imitate",
+        POLICIES[0],
+        held_out=best.validation,
+        checkpoint=best.checkpoint,
+        beginning=float(best.number),
+    )
+
+
+class Beginning:
+    """One of the initial weights that are tried: some take many times longer to ground a word."""
+
+    def __init__(
+        self,
+        options: DictConfig,
+        stage: Stage,
+        seen: ReplayBuffer,
+        held_out: ReplayBuffer | None,
+        number: int,
+    ) -> None:
+        self.options, self.stage, self.seen, self.number = options, stage, seen, number
+        seed = derive(options.seed, "beginning", number) if number else options.seed
+        self.loss = ImitationLoss(build(make_policy, options, seed=seed))
+        self.validation = HeldOut(self.loss, held_out) if held_out is not None else None
+        self.checkpoint = stage.checkpoint.with_stem(f"{stage.checkpoint.stem}-{number}")
+
+    def try_out(self) -> float:
+        """Learn for a few steps, leave a checkpoint to go on from, and return the loss."""
+        config = fit_config(self.options.imitate)
+        steps = self.options.imitate.trial_steps
+        history = fit(
+            self.loss,
+            self.seen,
+            config,
+            seed=self.options.seed,
+            name=self.stage.name,
+            checkpoint=self.checkpoint,
+            checkpoint_seconds=self.options.checkpoint_seconds,
+            held_out=self.validation,
+            progress=shows_progress(self.options),
+            settings=self.stage.settings,
+            until=steps,
+        )
+        return history[: math.ceil(steps / config.iteration)][-1]["loss_imitation"]
 
 
 def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, ReplayBuffer | None]:

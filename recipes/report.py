@@ -16,11 +16,13 @@ from ifo_grounding.report import (
     audit_figure,
     improved_episodes,
     instruction_cases,
+    reliability_diagram,
     results_rows,
     success_over_iterations,
     training_curves,
     write_report,
 )
+from ifo_grounding.report.results import restored
 from ifo_grounding.training import Run
 
 CURVES = {
@@ -53,6 +55,9 @@ def report(options: DictConfig) -> Path:
             choose=options.instruction.choose,
             stream="validation",
             **evaluation_world(options),
+        )
+        pictures["How often random pairs are suitable, against what is said"] = reliability_diagram(
+            [(said, restored(Rate, rate)) for said, rate in results["suitability"]["reliability"]]
         )
     pictures |= curves(run)
     return write_report(

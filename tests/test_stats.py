@@ -16,6 +16,7 @@ from ifo_grounding.stats import (
     correlation,
     holm,
     paired_difference,
+    reliability,
     two_level_bootstrap,
     wilson,
 )
@@ -224,3 +225,20 @@ def test_correlation_against_scipy():
 def test_correlation_is_undefined_without_variation():
     assert math.isnan(correlation([1, 1, 1, 1], [0, 1, 0, 1]).value)
     assert correlation([1, 1, 1, 1], [0, 1, 0, 1]).as_dict()["value"] is None
+
+
+def test_reliability_of_a_calibrated_and_of_an_overconfident_forecast():
+    source = np.random.default_rng(0)
+    said = source.uniform(size=200_000)
+    calibrated = reliability(said, source.uniform(size=200_000) < said)
+    assert len(calibrated) == 10
+    assert all(rate.low - 0.01 < share < rate.high + 0.01 for share, rate in calibrated)
+    overconfident = reliability(np.full(1000, 0.95), source.uniform(size=1000) < 0.5)
+    [(share, rate)] = overconfident
+    assert share == pytest.approx(0.95) and rate.high < 0.6 and rate.count == 1000
+    assert reliability([1.0], [True])[0][1].successes == 1
+    for wrong in ([0.5], [0, 1]), ([1.2], [1]):
+        with pytest.raises(UserError):
+            reliability(*wrong)
+    with pytest.raises(UserError, match="bins"):
+        reliability([0.5], [1], bins=0)

@@ -178,3 +178,18 @@ def test_a_state_is_servable_if_one_instruction_of_the_pool_suits_it():
     pool = ["move to the red circle", "move to the red circle"]
     result = suitable_rate(nothing, "move", pool, states=400, pairs_per_state=400)
     assert result.servable.rate == pytest.approx(result.base_rate.rate)
+
+
+def test_the_reliability_of_pairs_is_that_of_what_was_said():
+    sure = TensorDictModule(
+        lambda pixels, instruction: torch.full((len(pixels), 1), 2.0),
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+    result = suitable_rate(sure, "move", ["move to the red circle"], states=300)
+    [(said, rate)] = result.reliability
+    assert said == pytest.approx(1 / (1 + math.exp(-2)))
+    assert rate.rate == result.base_rate.rate and rate.count == 1200
+    assert result.as_dict()["reliability"] == [[said, rate.as_dict()]]
+    silent = suitable_rate(sure, "move", ["move to the red circle"], states=9, pairs_per_state=0)
+    assert silent.reliability == []

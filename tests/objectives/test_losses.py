@@ -119,16 +119,16 @@ def test_the_contrast_is_the_cross_entropy_of_the_own_instruction_by_hand():
     pool = torch.tensor([[1, 0], [2, 0]])
     data = TensorDict({"pixels": torch.zeros(2, 1), "instruction": pool}, [2])
     network = suitability([0.9, 0.6])
-    plain = InstructionLoss(network, pool, negatives=3, removal_rate=0.0)
-    contrasted = InstructionLoss(network, pool, negatives=3, removal_rate=0.0, contrast=2.0)
-    odds = 9.0, 1.5  # of 0.9 and 0.6; each scene's three negatives are the other's instruction
-    first = -math.log(odds[0] / (odds[0] + 3 * odds[1]))
-    second = -math.log(odds[1] / (odds[1] + 3 * odds[0]))
+    plain = InstructionLoss(network, pool, negatives=1, removal_rate=0.0)
+    contrasted = InstructionLoss(network, pool, negatives=1, removal_rate=0.0, contrast=2.0)
+    odds = 9.0, 1.5  # of 0.9 and 0.6; each scene's negative is the other's instruction
+    first = -math.log(odds[0] / (odds[0] + odds[1]))
+    second = -math.log(odds[1] / (odds[1] + odds[0]))
     added = contrasted(data)["loss_instruction"] - plain(data)["loss_instruction"]
     assert added.item() == pytest.approx(2.0 * (first + second) / 2, rel=1e-5)
     # Negatives that are removed take no part: the first scene's own is the likeliest one.
-    half = InstructionLoss(network, pool, negatives=3, removal_rate=0.5, contrast=1.0)
-    rest = InstructionLoss(network, pool, negatives=3, removal_rate=0.5)
+    half = InstructionLoss(network, pool, negatives=1, removal_rate=0.5, contrast=1.0)
+    rest = InstructionLoss(network, pool, negatives=1, removal_rate=0.5)
     added = half(data)["loss_instruction"] - rest(data)["loss_instruction"]
     assert added.item() == pytest.approx(first / 2, rel=1e-5)
 

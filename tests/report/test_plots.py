@@ -14,6 +14,7 @@ from ifo_grounding.report import (
     confusion,
     figure_png,
     phase_bars,
+    reliability_diagram,
     save_figure,
     success_over_iterations,
     training_curves,
@@ -148,3 +149,13 @@ def test_colours_stay_apart_for_colour_blind_readers(kind, colours):
     seen = 255 * np.clip(linear @ np.array(MACHADO[kind]).T, 0, 1) ** (1 / 2.2)
     distance = np.linalg.norm(seen[:, None] - seen[None], axis=-1)
     assert distance[np.triu_indices(3, 1)].min() > 40
+
+
+def test_reliability_diagram_shows_every_bin_with_its_interval_and_count():
+    bins = [(0.15, wilson(200, 1000)), (0.85, wilson(40, 50))]
+    axes = reliability_diagram(bins).axes[0]
+    (points, _, _) = axes.containers[0]
+    assert points.get_xydata().tolist() == [[0.15, 0.2], [0.85, 0.8]]
+    assert [text.get_text() for text in axes.texts] == ["1,000", "50"]
+    with pytest.raises(UserError, match="at least one bin"):
+        reliability_diagram([])

@@ -53,6 +53,20 @@ def test_fit_is_a_function_of_its_seed(buffer):
     assert losses[0] == losses[1] != losses[2]
 
 
+def test_a_run_that_paused_goes_on_to_the_same_weights(buffer, tmp_path):
+    config = FitConfig(steps=12, batch_size=32, iteration=3)
+    whole, parts, path = imitation(0.25), imitation(0.25), tmp_path / "run.pt"
+    expected = fit(whole, buffer, config, seed=0)
+    steps = []
+    begun = fit(parts, buffer, config, seed=0, checkpoint=path, until=5)
+    assert [row["step"] for row in begun] == [3, 6]  # whole iterations
+    assert begun[-1]["loss_imitation"] == expected[1]["loss_imitation"]
+    fit(parts, buffer, config, seed=0, checkpoint=path, log=lambda _, step: steps.append(step))
+    assert steps == [9, 12]
+    for name, weight in parts.state_dict().items():
+        assert torch.equal(weight, whole.state_dict()[name])
+
+
 def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path):
     config = FitConfig(steps=12, batch_size=32, iteration=3)
     whole = imitation(0.25)

@@ -13,7 +13,7 @@ from torch import Tensor
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import MAX_STEPS, device_of
 from ifo_grounding.seeding import generator
-from ifo_grounding.stats import Estimate, Rate, auc, wilson
+from ifo_grounding.stats import Estimate, Rate, auc, reliability, wilson
 from ifo_grounding.tasks.goals import REASONS, Goal, verdict
 from ifo_grounding.tasks.grammar import FIELDS, grammar
 from ifo_grounding.tasks.scenes import SceneOptions, SceneStream
@@ -64,13 +64,17 @@ class SuitabilityResult:
     """Share of suitable pairs among random pairs of a state and an instruction of the pool."""
     auc: Estimate
     """Probability that a suitable pair scores above an unsuitable one."""
+    reliability: list[tuple[float, Rate]]
+    """Of random pairs, by bins of the probability that they are said to have: its mean, and the
+    share that is suitable. Equal where the module is calibrated."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         names = ("rate", "served", "servable", "precision", "recall", "base_rate", "auc")
         intervals = {name: getattr(self, name).as_dict() for name in names}
         bits = {"entropy": self.entropy, "most_entropy": self.most_entropy}
-        return {**intervals, **bits, "errors": dict(self.errors)}
+        bins = [[said, rate.as_dict()] for said, rate in self.reliability]
+        return {**intervals, **bits, "reliability": bins, "errors": dict(self.errors)}
 
     def __str__(self) -> str:
         """Return the suitable rate with its interval."""
@@ -294,6 +298,7 @@ def _threshold_quality(pairs: list[tuple[Tensor, Tensor]], threshold: float) -> 
             positive_groups=group[truth].numpy(),
             negative_groups=group[~truth].numpy(),
         ),
+        "reliability": reliability(logits.sigmoid().numpy(), truth.numpy()),
     }
 
 

@@ -47,7 +47,8 @@ class InstructionLoss(SupervisedLoss):
     Args:
         network: an image and an instruction to a logit, as ``make_instruction_classifier`` builds.
         pool: token ids [P, L] of the instructions of the demonstrations.
-        negatives: how many negatives each scene is scored with; they share its image's encoding.
+        negatives: how many negatives each scene is scored with, at most as many as there are other
+            instructions; they share its image's encoding.
         removal_rate: share of a batch's negatives to remove, those scored highest; with
             ``"estimated"``, as large as their scores say that the share of suitable ones is.
         warmup: share of training before which none is removed; see :meth:`set_progress`.
@@ -96,8 +97,8 @@ class InstructionLoss(SupervisedLoss):
         if contrast < 0:
             raise UserError(f"contrast is a weight of at least 0, got {contrast}")
         self.contrast = contrast
-        self.count = negatives
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator)
+        self.count = min(negatives, len(self.negatives.pool) - 1)
 
     def set_progress(self, fraction: float) -> None:
         """Say which share of training is done, in [0, 1]; until told, training counts as late."""

@@ -222,6 +222,53 @@ def _bar(axes: Axes, at: float, width: float, rate: Rate | float, colour: str) -
     axes.text(at, top + 0.02, text, ha="center", va="bottom", fontsize=9, color=LIGHT["ink"])
 
 
+def reliability_diagram(bins: Sequence[tuple[float, Rate]], *, title: str = "") -> Figure:
+    """Draw what came true against what was said, with intervals; the diagonal is calibrated.
+
+    Args:
+        bins: as :func:`ifo_grounding.stats.reliability` returns them.
+        title: above the plot.
+
+    >>> from ifo_grounding.stats import reliability
+    >>> reliability_diagram(reliability([0.2, 0.8, 0.9], [0, 1, 1])).axes[0].get_xlabel()
+    'said'
+    """
+    if not bins:
+        raise UserError("a reliability diagram needs at least one bin")
+    figure, grid = _figure(4.4, 4.0)
+    axes = grid[0, 0]
+    _dress(axes, title, "said", "came true", grid="both")
+    axes.plot([0, 1], [0, 1], color=LIGHT["faint"], linestyle="--", linewidth=1.2)
+    said = [place for place, _ in bins]
+    true = [rate.rate for _, rate in bins]
+    below = [rate.rate - rate.low for _, rate in bins]
+    above = [rate.high - rate.rate for _, rate in bins]
+    axes.errorbar(
+        said,
+        true,
+        yerr=[below, above],
+        color=PALETTE[0],
+        linewidth=1.8,
+        marker="o",
+        ms=5,
+        capsize=3,
+    )
+    for place, rate in bins:
+        text = f"{rate.count:,}"
+        axes.annotate(
+            text,
+            (place, rate.rate),
+            (7, -11),
+            textcoords="offset points",
+            fontsize=8,
+            color=LIGHT["faint"],
+        )
+    _percent(axes)
+    axes.set_xlim(-0.02, 1.1)
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    return figure
+
+
 def confusion(matrix: ArrayLike, names: Sequence[str], *, title: str = "Labels") -> Figure:
     """Draw a confusion matrix: rows are the truth, columns what was given, in percent of rows.
 

@@ -5,6 +5,7 @@ function of its ``seed``.
 """
 
 from ifo_grounding.stats.association import auc, correlation
+from ifo_grounding.stats.calibration import reliability
 from ifo_grounding.stats.rates import (
     RESAMPLES,
     holm,
@@ -23,6 +24,7 @@ __all__ = [
     "correlation",
     "holm",
     "paired_difference",
+    "reliability",
     "two_level_bootstrap",
     "wilson",
 ]

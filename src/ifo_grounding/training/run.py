@@ -108,18 +108,25 @@ class Stage:
         if record.get("settings") == settings:
             self.result = record["result"]
         self.checkpoint = run.folder / "checkpoints" / f"{name}.pt"
+        self._continues = any(path.exists() for path in self.checkpoints())
         self._start = time.monotonic()
+
+    def checkpoints(self) -> list[Path]:
+        """Return the checkpoint and those beside it, named after it with a dash."""
+        folder, stem = self.checkpoint.parent, self.checkpoint.stem
+        return [self.checkpoint, *sorted(folder.glob(f"{stem}-*.pt"))]
 
     def finish(
         self, result: dict[str, Any], history: Sequence[Metrics] | None = None
     ) -> dict[str, Any]:
-        """Record that the stage is done, drop its checkpoint, and return ``result``."""
+        """Record that the stage is done, drop its checkpoints, and return ``result``."""
         seconds = round(time.monotonic() - self._start, 1)
         if history is not None:
             write_json(self.run.folder / "metrics" / f"{self.name}.json", list(history))
         record = {"settings": self.settings, "result": result, "seconds": seconds}
         write_json(self.run._record_path(self.name), record)
-        self.checkpoint.unlink(missing_ok=True)
+        for path in self.checkpoints():
+            path.unlink(missing_ok=True)
         self.result = result
         return result
 
@@ -134,7 +141,7 @@ class Stage:
         from torchrl.record.loggers import get_logger
 
         folder = self.run.folder / "logs"
-        logged = _last_step(folder / self.name) if self.checkpoint.exists() else -1
+        logged = _last_step(folder / self.name) if self._continues else -1
         options = (
             {"wandb_kwargs": {"project": "ifo-grounding"}} if self.run.logger == "wandb" else {}
         )

@@ -121,6 +121,7 @@ def fit(
     held_out: Validation | None = None,
     progress: bool = False,
     settings: Any = None,
+    until: int | None = None,
 ) -> list[Metrics]:
     """Minimise a loss module over samples of a replay buffer.
 
@@ -139,6 +140,8 @@ def fit(
             best there are kept in the end.
         progress: whether to show a progress bar.
         settings: what else decides the result; a checkpoint made with other settings is refused.
+        until: steps after which to pause, rounded up to whole iterations; a later call with the
+            same checkpoint goes on. None learns to the end.
 
     Returns:
         Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
@@ -153,8 +156,9 @@ def fit(
     history: list[Metrics] = state["history"]
     iterations = math.ceil(config.steps / config.iteration)
     last_save = time.monotonic()
-    with _bar(iterations, state["iteration"], name, progress) as bar:
-        for iteration in range(state["iteration"], iterations):
+    pause_at = iterations if until is None else min(math.ceil(until / config.iteration), iterations)
+    with _bar(pause_at, state["iteration"], name, progress) as bar:
+        for iteration in range(state["iteration"], pause_at):
             torch.manual_seed(derive(seed, name, iteration))
             first = iteration * config.iteration
             steps = range(first, min(first + config.iteration, config.steps))
@@ -174,7 +178,7 @@ def fit(
             bar.set_postfix(_brief(metrics), refresh=False)
             bar.update()
             pause = time.monotonic() - last_save
-            if saved and (pause > checkpoint_seconds or done == iterations):
+            if saved and (pause > checkpoint_seconds or done == pause_at):
                 saved.save({"iteration": done, "history": history})
                 last_save = time.monotonic()
     return history
