@@ -8,14 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ifo_grounding.files import atomic_write, read_json
-from ifo_grounding.report import markdown_table, results_rows
+from ifo_grounding.report import compared_rates, markdown_table, results_rows, save_figure
 from ifo_grounding.report.results import restored
 from ifo_grounding.stats import Difference, Rate, paired_difference, two_level_bootstrap
 from ifo_grounding.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
+PICTURE = ROOT / "docs" / "assets" / "studies.png"
+NAMES = {
+    "phase1": "phase 1",
+    "continued": "imitation continued",
+    "cloned": "accepted rollouts cloned",
+    "phase2": "phase 2",
+}
 MARKS = ("<!-- results -->", "<!-- /results -->")
 
 
@@ -81,9 +89,20 @@ def study_section() -> list[str]:
         " scene. `continued` and `cloned` are the [controls](phase2.md#controls). The last two"
         " columns hold each seed's share of suitable instructions among those chosen, and of"
         " states served.",
+        f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table(rows),
         "\n".join(f"- {command}" for command in commands),
     ]
+
+
+def study_picture() -> Figure:
+    """Draw what the studies compare."""
+    groups = {}
+    for (task, n, kind), runs in studies().items():
+        known = [name for name in NAMES if all(name in run["results"] for run in runs)]
+        title = f"{task}, {n:,} demonstrations, {kind}, {len(runs)} seeds"
+        groups[title] = {NAMES[name]: two_level_bootstrap(outcomes(runs, name)) for name in known}
+    return compared_rates(groups)
 
 
 def brief(value: Rate | Difference) -> str:
@@ -156,6 +175,8 @@ def main() -> None:
     for path, text in written().items():
         with atomic_write(path) as temporary:
             temporary.write_text(text)
+    if studies():
+        save_figure(study_picture(), PICTURE)
 
 
 if __name__ == "__main__":

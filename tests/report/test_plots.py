@@ -11,6 +11,7 @@ from PIL import Image
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.report import (
+    compared_rates,
     confusion,
     figure_png,
     phase_bars,
@@ -159,3 +160,17 @@ def test_reliability_diagram_shows_every_bin_with_its_interval_and_count():
     assert [text.get_text() for text in axes.texts] == ["1,000", "50"]
     with pytest.raises(UserError, match="at least one bin"):
         reliability_diagram([])
+
+
+def test_compared_rates_shows_each_interval_in_its_group():
+    rates = {"phase 1": wilson(960, 1000), "phase 2": wilson(990, 1000)}
+    axes = compared_rates({"move": rates, "pick": {"phase 2": wilson(500, 1000)}}).axes[0]
+    intervals = [line.get_xdata().tolist() for line in axes.lines if len(line.get_xdata()) == 2]
+    assert intervals[0] == [rates["phase 1"].low, rates["phase 1"].high]
+    assert len(intervals) == 3
+    shown = {text.get_text() for text in axes.texts}
+    assert {"move", "pick", "96.0", "99.0", "50.0"} == shown
+    # Both tasks' phase 2 have one colour.
+    assert axes.lines[2].get_color() == axes.lines[4].get_color() != axes.lines[0].get_color()
+    with pytest.raises(UserError, match="at least one group"):
+        compared_rates({})

@@ -12,6 +12,7 @@ from ifo_grounding.report.casestudy import (
 from ifo_grounding.report.metrics import read_metrics
 from ifo_grounding.report.page import write_report
 from ifo_grounding.report.plots import (
+    compared_rates,
     confusion,
     figure_png,
     phase_bars,
@@ -29,6 +30,7 @@ __all__ = [
     "animation",
     "audit_figure",
     "changed_scenes",
+    "compared_rates",
     "confusion",
     "figure_png",
     "format_cell",
