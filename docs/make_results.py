@@ -66,6 +66,7 @@ def study_section() -> list[str]:
             "demonstrations": f"{n:,}",
             "preset": kind,
             "seeds": len(runs),
+            "scenes": f"{both[0].shape[1]:,}",
             "phase 1": brief(two_level_bootstrap(both[0])),
             "phase 2": brief(two_level_bootstrap(both[1])),
             "gain, points": brief(paired_difference(*both)),
@@ -84,7 +85,7 @@ def study_section() -> list[str]:
         return []
     return [
         "## Studies",
-        "Several training seeds each; greedy success on 2,000 evaluation scenes in percent, with"
+        "Several training seeds each; greedy success on the same evaluation scenes in percent, with"
         " 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired by"
         " scene. `continued` and `cloned` are the [controls](phase2.md#controls). The last two"
         " columns hold each seed's share of suitable instructions among those chosen, and of"
