@@ -48,6 +48,14 @@ class Pairs:
     index: Tensor
     """Which pair lies in each cell of each row, int64 [R, h * w]."""
 
+    def __len__(self) -> int:
+        """Return the number of distinct pairs."""
+        return len(self.cell)
+
+    def __getitem__(self, some: slice) -> Pairs:
+        """Return some of the pairs; where they lie stays numbered as it was."""
+        return Pairs(self.cell[some], self.instruction[some], self.index)
+
 
 def pair_up(cells: Tensor, instructions: Tensor, n_cells: int, n_instructions: int) -> Pairs:
     """Find the distinct pairs of a cell and an instruction.

@@ -20,7 +20,7 @@ from ifo_grounding.networks.building import (
     construct,
     wrap,
 )
-from ifo_grounding.networks.cells import Cells, hidden_from_python
+from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up, pair_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.fusion import (
     CellCount,
@@ -43,9 +43,20 @@ from ifo_grounding.networks.trunk import (
     head,
     image_encoder,
     instruction_encoder,
-    read_pairs,
     same_batch,
 )
+
+CELLS_AT_ONCE, ROWS_AT_ONCE = 1 << 16, 1 << 12
+"""Cells and pairs that are computed together, to bound memory."""
+
+
+def slices(size: int, at_once: int) -> list[slice]:
+    """Cut a range into parts; an empty range is one part.
+
+    >>> slices(5, 3)
+    [slice(0, 3, None), slice(3, 6, None)]
+    """
+    return [slice(begin, begin + at_once) for begin in range(0, max(size, 1), at_once)]
 
 
 class PairScorer(Network):
@@ -127,12 +138,30 @@ class PairScorer(Network):
         if not isinstance(scenes, Cells):
             repeated = scenes.unsqueeze(1).expand(-1, count, *scenes.shape[1:]).flatten(0, 1)
             return self.score(repeated, words[which]).reshape(rows, count)
+        places = scenes.index.repeat_interleave(count, 0)
+        pairs = pair_up(places, which, len(scenes.features), len(words))
         with self.autocast(words):
-            places = scenes.index.repeat_interleave(count, 0)
-            fused, lying = fuse_pairs(self.fusion, Cells(scenes.features, places), words, which)
-            seen = [read_pairs(part, fused, lying) for part in (self.readout, self.count)]
-            outputs = self.head(torch.cat(seen, -1))
-        return outputs.float().reshape(rows, count) + self.prior
+            parts = [
+                self._outlook(fuse_pairs(self.fusion, scenes.features, words, pairs[some]))
+                for some in slices(len(pairs), CELLS_AT_ONCE)
+            ]
+            outlook = torch.cat(parts)
+            outputs = [
+                self.head(self._read(look_up(outlook, pairs.index[some])))
+                for some in slices(len(which), ROWS_AT_ONCE)
+            ]
+        return torch.cat(outputs).float().reshape(rows, count) + self.prior
+
+    def _outlook(self, fused: Tensor) -> Tensor:
+        """Return all that is read of each cell, [Q, ...], of features [Q, F, 1, 1]."""
+        parts = [part.outlook(fused).flatten(1) for part in (self.readout, self.count)]
+        return torch.cat(parts, -1)
+
+    def _read(self, outlook: Tensor) -> Tensor:
+        """Read the cells of scenes, [N, h * w, ...]."""
+        sizes = [outlook.shape[-1] - self.config.detectors, self.config.detectors]
+        looked, counted = outlook.split(sizes, -1)
+        return torch.cat([self.readout.read(looked), self.count.read(counted)], -1)
 
     def score(self, features: Tensor, instruction: Tensor) -> Tensor:
         """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""

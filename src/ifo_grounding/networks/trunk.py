@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up, pair_up
+from ifo_grounding.networks.cells import Cells, Pairs, hidden_from_python, look_up, pair_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     ConvEncoder,
@@ -22,7 +22,6 @@ from ifo_grounding.networks.encoders import (
     PatchEncoder,
 )
 from ifo_grounding.networks.fusion import (
-    CellCount,
     GatedAttention,
     ResidualBlock,
     ResidualFiLM,
@@ -102,32 +101,23 @@ def distinct_instructions(encoder: InstructionEncoder, tokens: Tensor) -> tuple[
         return encoder.distinct(tokens)
 
 
-def fuse_pairs(
-    fusion: nn.ModuleList, cells: Cells, words: Tensor, which: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Fuse every distinct pair of a cell and an instruction, where no cell sees another.
+def fuse_pairs(fusion: nn.ModuleList, features: Tensor, words: Tensor, pairs: Pairs) -> Tensor:
+    """Fuse distinct pairs of a cell and an instruction, where no cell sees another.
 
     Args:
         fusion: blocks of :class:`~ifo_grounding.networks.ResidualFiLM` of kernel 1.
-        cells: of R rows.
+        features: of distinct cells [U, F].
         words: encoded instructions [P, D].
-        which: the instruction of each row, int64 [R].
+        pairs: which of them belong together, [Q].
 
     Returns:
-        Fused features of each pair, as images of one cell, [Q, F, 1, 1], and the pair in each
-        cell of each row, int64 [R, h * w].
+        Fused features of each pair, as images of one cell, [Q, F, 1, 1].
     """
-    pairs = pair_up(cells.index, which, len(cells.features), len(words))
-    fused = look_up(cells.features, pairs.cell)[..., None, None]
+    fused = look_up(features, pairs.cell)[..., None, None]
     for block in fusion:
         assert isinstance(block, ResidualFiLM)
         fused = block.modulate(fused, look_up(block.film(words), pairs.instruction))
-    return F.relu(fused), pairs.index
-
-
-def read_pairs(part: SpatialReadout | CellCount, fused: Tensor, index: Tensor) -> Tensor:
-    """Read fused pairs [Q, F, 1, 1] where ``index`` [R, h * w] says that they lie: [R, size]."""
-    return part.read(look_up(part.outlook(fused).flatten(1), index))
+    return F.relu(fused)
 
 
 def cells_are_alone(config: NetworkConfig) -> bool:
@@ -216,7 +206,10 @@ class Trunk(nn.Module):
             cells = distinct_cells(self.image, image)
             if cells is not None:
                 words, which = distinct_instructions(self.instruction, tokens)
-                return read_pairs(self.readout, *fuse_pairs(self.fusion, cells, words, which))
+                pairs = pair_up(cells.index, which, len(cells.features), len(words))
+                fused = fuse_pairs(self.fusion, cells.features, words, pairs)
+                outlook = self.readout.outlook(fused).flatten(1)
+                return self.readout.read(look_up(outlook, pairs.index))
         return self.readout(self.fuse(image, tokens))
 
 

@@ -111,7 +111,9 @@ class PoolScorer:
         """
         self.scored += index.numel()
         device = device_of(self.classifier) or index.device
-        rows = max(1, AT_ONCE // max(1, index.shape[1]))
+        # Encoded scenes that are no tensor bound their memory themselves, and gain from many rows.
+        whole = not isinstance(states, Tensor)
+        rows = max(1, len(index) if whole else AT_ONCE // max(1, index.shape[1]))
         with evaluating(self.classifier):
             parts = [
                 self._candidates(
