@@ -18,14 +18,16 @@ from _shared import (
     shows_progress,
     simulator,
 )
+from imitate import labelled_demonstrations
 from omegaconf import DictConfig
+from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import networks
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import labelled_buffer
-from ifo_grounding.objectives import RewardLoss
-from ifo_grounding.training import Adversary, select_pairs, self_examine
+from ifo_grounding.objectives import ImitationLoss, RewardLoss
+from ifo_grounding.training import Adversary, Rehearsal, select_pairs, self_examine
 from ifo_grounding.training.run import Run
 from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
 
@@ -50,6 +52,7 @@ def examine(options: DictConfig) -> dict:
         self_examination_config(section),
         seed=options.seed,
         adversary=adversary,
+        rehearsal=rehearsal(policy, run, options),
         checkpoint=stage.checkpoint,
         log=stage.log(),
         callback=audit_callback(policy, reward, run, options),
@@ -58,6 +61,15 @@ def examine(options: DictConfig) -> dict:
     )
     networks.save(policy, run / POLICIES[1])
     return stage.finish(history[-1], history)
+
+
+def rehearsal(policy: nn.Module, run: Run, options: DictConfig) -> Rehearsal | None:
+    """Return what imitates the demonstrations on, where that is wanted."""
+    weight = options.self_examine.rehearsal
+    if not weight:
+        return None
+    seen, _ = labelled_demonstrations(run, options.imitate.held_out)
+    return Rehearsal(ImitationLoss(policy), seen, weight)
 
 
 def practice(

@@ -1,15 +1,23 @@
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import make_policy, make_reward_model, make_value
-from ifo_grounding.objectives import RewardLoss
+from ifo_grounding.objectives import ImitationLoss, RewardLoss
 from ifo_grounding.tasks import grammar
-from ifo_grounding.training import Adversary, SelfExaminationConfig, select_pairs, self_examine
+from ifo_grounding.training import (
+    Adversary,
+    Rehearsal,
+    SelfExaminationConfig,
+    select_pairs,
+    self_examine,
+)
 from ifo_grounding.training.environment import summary
 from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
 
@@ -67,6 +75,32 @@ def test_a_policy_learns_what_the_judge_likes(algorithm):
     )
     assert history[0]["learned_reward"] < 0.35
     assert history[-1]["learned_reward"] > 0.6
+
+
+def test_rehearsal_keeps_what_the_demonstrations_show():
+    """Demonstrations that always take action 3 hold against a judge that likes action 1."""
+    demos = TensorDictReplayBuffer(storage=LazyTensorStorage(64))
+    frames = simulator(64).reset()[keys.PIXELS]
+    words = POOL[torch.arange(64) % len(POOL)]
+    shown = {keys.PIXELS: frames, keys.INSTRUCTION: words, keys.ACTION: torch.full((64,), 3)}
+    demos.extend(TensorDict(shown, [64]))
+    shares = {}
+    for weight in (0.0, 10.0):
+        env, (policy, value) = make_env(likes(1)), make_networks()
+        history = self_examine(
+            env,
+            policy,
+            value,
+            config(iterations=10, gamma=0.0, lr=3e-3, epochs=3),
+            seed=0,
+            rehearsal=Rehearsal(ImitationLoss(policy), demos, weight, 32) if weight else None,
+        )
+        assert ("loss_rehearsal" in history[-1]) == bool(weight)
+        action = policy(TensorDict(shown, [64]))[keys.ACTION]
+        shares[weight] = float((action == 3).float().mean())
+    assert shares[0.0] < 0.3 and shares[10.0] > 0.8
+    with pytest.raises(UserError, match="positive weight"):
+        Rehearsal(ImitationLoss(policy), demos, 0.0)
 
 
 def test_value_warm_up_leaves_the_policy_as_it_was():

@@ -5,6 +5,7 @@ from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
 from ifo_grounding.training.cloning import accepted, accepted_steps
 from ifo_grounding.training.held_out import HeldOut
 from ifo_grounding.training.pairs import load_pairs, save_pairs, select_pairs
+from ifo_grounding.training.rehearsal import Rehearsal
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.training.self_examination import SelfExaminationConfig, self_examine
 from ifo_grounding.training.supervised import FitConfig, fit
@@ -14,6 +15,7 @@ __all__ = [
     "Checkpoint",
     "FitConfig",
     "HeldOut",
+    "Rehearsal",
     "Run",
     "SelfExaminationConfig",
     "Stage",

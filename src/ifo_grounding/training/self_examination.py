@@ -29,6 +29,7 @@ from ifo_grounding.training.environment import (
     summary,
     transforms_of,
 )
+from ifo_grounding.training.rehearsal import Rehearsal
 from ifo_grounding.training.selection import Selection, SelectionSchedule
 from ifo_grounding.training.supervised import Callback, Log, Metrics, make_optimizer, update
 
@@ -101,6 +102,7 @@ def self_examine(
     *,
     seed: int,
     adversary: Adversary | None = None,
+    rehearsal: Rehearsal | None = None,
     checkpoint: str | Path | None = None,
     log: Log | None = None,
     callback: Callback | None = None,
@@ -118,6 +120,7 @@ def self_examine(
         seed: all randomness is a function of it and of the iteration, and every iteration starts
             from a reset: a run continues from its checkpoint to the same result.
         adversary: trains the reward model on, with the steps of each iteration.
+        rehearsal: imitates the demonstrations on.
         checkpoint: file to continue from and to save to.
         log: gets the metrics of each iteration.
         callback: gets the iteration, returns further metrics; the place for audits.
@@ -133,7 +136,7 @@ def self_examine(
     check_env(env)
     policy.eval()
     value.eval()
-    learner = _Learner(env, policy, value, config)
+    learner = _Learner(env, policy, value, config, rehearsal)
     sampler_stats(env)  # forgets the reset that a collector begins with
     schedule = SelectionSchedule(
         config.select_every,
@@ -206,8 +209,9 @@ class _Learner:
         policy: ProbabilisticTensorDictSequential,
         value: TensorDictModuleBase,
         config: SelfExaminationConfig,
+        rehearsal: Rehearsal | None = None,
     ) -> None:
-        self.config, self.policy = config, policy
+        self.config, self.policy, self.rehearsal = config, policy, rehearsal
         self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl else None
         self.collector = Collector(
             env,
@@ -268,6 +272,8 @@ class _Learner:
         for _ in range(epochs):
             for rows in torch.randperm(len(steps)).split(config.minibatch):
                 losses = self.loss(steps[rows])
+                if self.rehearsal:
+                    losses["loss_rehearsal"] = self.rehearsal()
                 for key, scalar in update(losses, self.optimizer, config.grad_clip).items():
                     sums[key] = sums.get(key, torch.zeros(())) + scalar.cpu()
                 updates += 1
