@@ -11,13 +11,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ifo_grounding.files import atomic_write, read_json
-from ifo_grounding.report import compared_rates, markdown_table, results_rows, save_figure
+from ifo_grounding.report import (
+    audit_figure,
+    compared_rates,
+    markdown_table,
+    results_rows,
+    save_figure,
+)
 from ifo_grounding.report.results import restored
 from ifo_grounding.stats import Difference, Rate, paired_difference, two_level_bootstrap
 from ifo_grounding.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "assets" / "studies.png"
+HACKED = ROOT / "results" / "study" / "move-200-strong-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
     "continued": "imitation continued",
@@ -106,6 +113,11 @@ def study_picture() -> Figure:
     return compared_rates(groups)
 
 
+def hacking_picture() -> Figure | None:
+    """Draw the audit of the run that the page of phase 2 shows as an example of reward hacking."""
+    return audit_figure(read_json(HACKED)["audit"]) if HACKED.exists() else None
+
+
 def brief(value: Rate | Difference) -> str:
     return str(value).rpartition(" (")[0].replace(" points", "")
 
@@ -178,6 +190,8 @@ def main() -> None:
             temporary.write_text(text)
     if studies():
         save_figure(study_picture(), PICTURE)
+    if (hacked := hacking_picture()) is not None:
+        save_figure(hacked, PICTURE.with_name("hacking.png"))
 
 
 if __name__ == "__main__":

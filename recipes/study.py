@@ -5,14 +5,16 @@ python recipes/study.py task=move budget=study demonstrations.n=1000 seed=0 resu
 
 from pathlib import Path
 
+from _shared import open_run
 from controls import clone_accepted, continue_imitation
 from evaluate import evaluate
 from omegaconf import DictConfig
 from two_phase import train_phases, write_result
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.files import write_json
+from ifo_grounding.files import read_json, write_json
 from ifo_grounding.report import results_table
+from ifo_grounding.report.audit import PANELS
 
 
 def study(options: DictConfig) -> dict:
@@ -22,12 +24,20 @@ def study(options: DictConfig) -> dict:
         clone_accepted(options)
     results = evaluate(options)
     content = write_result(options, results, "run study")
+    content["audit"] = audit(options)
     folder = options.results
     if folder:
         parts = [options.task, options.demonstrations.n, options.network, options.variant]
         name = "-".join(str(part) for part in parts if part)
         write_json(Path(folder) / f"{name}-seed{options.seed}.json", content)
     return results
+
+
+def audit(options: DictConfig) -> list[dict[str, float]]:
+    """Return of every iteration of phase 2 what the picture of the audit shows."""
+    shown = {"step", *(name for lines in PANELS.values() for name in lines)}
+    history = read_json(open_run(options) / "metrics" / "self_examine.json")
+    return [{k: round(v, 5) for k, v in row.items() if k in shown} for row in history]
 
 
 @recipe_main
