@@ -2,7 +2,7 @@
 
 import sys
 
-from _shared import open_run, plain
+from _shared import CONTROLS, POLICIES, open_run, plain
 from collect_transitions import collect
 from evaluate import evaluate
 from imitate import imitate
@@ -21,6 +21,16 @@ from ifo_grounding.report import provenance, results_table
 from ifo_grounding.training import Run
 from report import report
 
+PHASE_2 = (
+    "self_examine",
+    "continue_imitation",
+    "clone_accepted",
+    "evaluate",
+    POLICIES[1],
+    *CONTROLS,
+)
+"""Stages and networks that a run makes anew where it takes over another's phase 1."""
+
 
 def two_phase(options: DictConfig) -> dict:
     train_phases(options)
@@ -32,7 +42,7 @@ def two_phase(options: DictConfig) -> dict:
 def train_phases(options: DictConfig) -> None:
     run = open_run(options)
     if options.base:
-        run.take_over(Run(options.base))
+        run.take_over(Run(options.base), without=PHASE_2)
     write_json(run / "options.json", plain(options))
     # Phase 1: imitation from observation.
     collect(options)

@@ -62,8 +62,10 @@ def test_a_run_takes_over_what_another_has_finished(tmp_path):
     first.stage("count", {"to": 3}).finish({"counted": 3})
     (first / "logs").mkdir()
     (first / "network.safetensors").write_bytes(b"weights")
+    first.stage("sum", {}).finish({"total": 6})
     second = Run(tmp_path / "second")
-    second.take_over(first)
+    second.take_over(first, without=["sum", "other.safetensors"])
+    assert second.stage("sum", {}).result is None
     assert second.stage("count", {"to": 3}).result == {"counted": 3}
     assert second.stage("count", {"to": 4}).result is None
     assert (second / "network.safetensors").read_bytes() == b"weights"

@@ -59,11 +59,15 @@ class Run:
             raise UserError(f"{path} is missing: run the recipe {recipe} with the same run first")
         return path
 
-    def take_over(self, other: Run) -> None:
+    def take_over(self, other: Run, without: Sequence[str] = ()) -> None:
         """Copy what another run has made, unless this one has begun.
 
         Its finished stages count as done here, as long as their settings are the same. A phase 2
         can so be repeated with other options, from the same phase 1.
+
+        Args:
+            other: the run to copy.
+            without: names of stages and files that this run is to make anew.
 
         Raises:
             UserError: where the other run does not exist.
@@ -72,7 +76,10 @@ class Run:
             return
         if not (other.folder / "stages").is_dir():
             raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
-        passing = shutil.ignore_patterns("logs", "checkpoints", "result.json", "options.json")
+        anew = [*without, *(f"{name}.json" for name in without)]
+        passing = shutil.ignore_patterns(
+            "logs", "checkpoints", "result.json", "options.json", *anew
+        )
         copy = self.folder.with_name(f"{self.folder.name}.copying")
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(other.folder, copy, ignore=passing)
