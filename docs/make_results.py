@@ -108,7 +108,7 @@ def study_picture() -> Figure:
     groups = {}
     for (task, n, kind), runs in studies().items():
         known = [name for name in NAMES if all(name in run["results"] for run in runs)]
-        title = f"{task}, {n:,} demonstrations, {kind}, {len(runs)} seeds"
+        title = f"{task}, {n:,} demonstrations, {kind}, seeds: {len(runs)}"
         groups[title] = {NAMES[name]: two_level_bootstrap(outcomes(runs, name)) for name in known}
     return compared_rates(groups)
 
