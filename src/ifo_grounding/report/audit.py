@@ -69,9 +69,9 @@ def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
             )
         axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
         if any(name in SHARES for name in lines):
-            low, high = axes.get_ylim()
-            _percent(axes, low=min(low, 0.9))
-            axes.set_ylim(top=max(1.02, high))  # a return can exceed 1
+            peak = max(row[name] for row in history for name in lines if name in row)
+            _percent(axes, low=min(axes.get_ylim()[0], 0.9))
+            axes.set_ylim(top=1.02 * max(1.0, peak))  # a return can exceed 1
         if len(lines) > 1:
             _legend(axes, loc="best")
     return figure
