@@ -96,9 +96,7 @@ def study_section() -> list[str]:
         " 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired by"
         " scene. `continued` and `cloned` are the [controls](phase2.md#controls). The last two"
         " columns hold each seed's share of suitable instructions among those chosen, and of"
-        " states served. Where the difference to a control equals the gain, the control ended as"
-        " phase 1 did: no later weights had a better likelihood on held-out demonstrations, by"
-        " which controls stop. With few demonstrations that is a strict rule for them.",
+        " states served.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table(rows),
         "\n".join(f"- {command}" for command in commands),

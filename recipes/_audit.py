@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from _shared import CLASSIFIER, REWARD, load_demonstrations, load_network, world
@@ -51,6 +52,8 @@ def audit_callback(
             **actions(),
         }
 
+    # The instruction module and the saved judge do not change while the policy practises.
+    @functools.cache
     def instructions() -> dict[str, float]:
         chosen = suitable_rate(
             classifier,
@@ -63,6 +66,7 @@ def audit_callback(
         )
         return {"suitable": chosen.rate.rate}
 
+    @functools.cache
     def actions() -> dict[str, float]:
         if options.self_examine.kind == "goal":
             return {}

@@ -16,8 +16,9 @@ from torchrl.data import ReplayBuffer
 from ifo_grounding import networks
 from ifo_grounding.data import Demonstrations, LabelReport
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
+from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
+from ifo_grounding.training.supervised import Validation
 from ifo_grounding.world import Layout
 
 torchrl_logger.setLevel("WARNING")
@@ -106,7 +107,7 @@ def train(
     buffer: ReplayBuffer,
     section: str,
     file: str,
-    held_out: HeldOut | None = None,
+    held_out: Validation | None = None,
     finish: Callable[[], Any] | None = None,
     checkpoint: Path | None = None,
     **found: float,

@@ -1,5 +1,6 @@
 """What phase 2 has to beat: its compute spent on imitation, and cloning what the judge accepts."""
 
+import math
 from typing import Any
 
 import torch
@@ -8,6 +9,7 @@ from _shared import (
     POLICIES,
     load_network,
     open_stage,
+    self_examination_config,
     train,
 )
 from imitate import labelled_demonstrations
@@ -15,28 +17,27 @@ from omegaconf import DictConfig, OmegaConf
 from self_examine import practice
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import EnvBase
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.training import HeldOut, Stage, accepted_steps
+from ifo_grounding.training import FitConfig, Rehearsal, Selection, Stage, accepted_steps
+
+NEEDS = ["imitate", "train_instruction", "train_goal"]
+SECTIONS = ["imitate", "self_examine", "instruction", "controls"]
 
 
 def continue_imitation(options: DictConfig) -> dict:
     """Imitate the demonstrations for as long again as phase 2 takes."""
-    needs = ["imitate"]
-    stage = open_stage(
-        options, "continue_imitation", ["imitate", "self_examine", "controls"], needs
-    )
+    stage = open_stage(options, "continue_imitation", SECTIONS, NEEDS)
     if stage.result is None:
-        imitate_on(options, stage, CONTROLS[0], None)
+        imitate_on(options, stage, CONTROLS[0], practice(stage.run, options)[0], None)
     return stage.result or {}
 
 
 def clone_accepted(options: DictConfig) -> dict:
     """Imitate the demonstrations and the rollouts of phase 1 that the judge accepts."""
-    needs = ["imitate", "train_instruction", "train_goal"]
-    sections = ["imitate", "self_examine", "instruction", "controls"]
-    stage = open_stage(options, "clone_accepted", sections, needs)
+    stage = open_stage(options, "clone_accepted", SECTIONS, NEEDS)
     if stage.result is None:
         section, run = options.self_examine, stage.run
         env, _, _ = practice(run, options)
@@ -48,38 +49,52 @@ def clone_accepted(options: DictConfig) -> dict:
             seed=options.seed,
             threshold=options.controls.accept,
         )
-        imitate_on(options, stage, CONTROLS[1], rollouts)
+        imitate_on(options, stage, CONTROLS[1], env, rollouts)
     return stage.result or {}
 
 
 def imitate_on(
-    options: DictConfig, stage: Stage, file: str, rollouts: TensorDict | None
+    options: DictConfig, stage: Stage, file: str, env: EnvBase, rollouts: TensorDict | None
 ) -> dict[str, Any]:
-    """Train the phase-1 policy on, with as many gradient samples as phase 2, and save it."""
-    run = stage.run
-    policy = load_network(run, POLICIES[0], "imitate", options)
-    loss = ImitationLoss(policy)
-    buffer, aside = labelled_demonstrations(run, options.imitate.held_out)
-    validation = HeldOut(loss, aside) if aside is not None else None
-    if validation is not None:
-        validation.look()  # phase 1 itself is the one to beat
+    """Train the phase-1 policy on, with as many gradient samples as phase 2, and save it.
+
+    The weights to keep are chosen as phase 2 chooses its own: by the learned return of the greedy
+    policy, as often, on the same starts.
+    """
+    section = options.self_examine
+    policy = load_network(stage.run, POLICIES[0], "imitate", options)
+    buffer, _ = labelled_demonstrations(stage.run, options.imitate.held_out)
     if rollouts is not None:
         buffer = Both(buffer, rollouts)
-    settings = {"imitate": {"steps": matched_steps(options), "lr": options.controls.lr}}
+    settings: dict[str, Any] = {"steps": matched_steps(options), "lr": options.controls.lr}
+    selection = None
+    if section.select_every:
+        chosen = self_examination_config(section)
+        selection = Selection(env, policy, chosen.selection, options.seed)
+        selection.look()  # phase 1 itself is the one to beat
+        looks = math.ceil(section.iterations / section.select_every)
+        iteration = options.imitate.get("iteration", FitConfig.iteration)
+        settings["validate_every"] = math.ceil(settings["steps"] / iteration / looks)
     accepted = {} if rollouts is None else {"accepted": float(len(rollouts))}
-    longer = OmegaConf.merge(options, settings)
-    return train(longer, stage, loss, buffer, "imitate", file, held_out=validation, **accepted)
+    longer = options.copy()
+    OmegaConf.set_struct(longer, False)  # not every budget names all settings
+    longer.imitate.update(settings)
+    loss = ImitationLoss(policy)
+    return train(longer, stage, loss, buffer, "imitate", file, held_out=selection, **accepted)
 
 
 def matched_steps(options: DictConfig) -> int:
     """Return how many batches of imitation are as many gradient samples as phase 2 takes.
 
     Every step that phase 2 collects passes policy and critic in each epoch, and the policy once
-    more when it is played, which costs a third of a gradient.
+    more when it is played, which costs a third of a gradient. What it rehearses comes on top.
     """
     section = options.self_examine
     collected = section.iterations * section.num_envs * section.steps
-    return round(collected * (2 * section.epochs + 1 / 3) / options.imitate.batch_size)
+    samples = collected * (2 * section.epochs + 1 / 3)
+    if section.rehearsal:
+        samples += collected / section.minibatch * section.epochs * Rehearsal.batch_size
+    return round(samples / options.imitate.batch_size)
 
 
 class Both:

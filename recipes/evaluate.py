@@ -38,8 +38,9 @@ HELD_OUT = 500
 
 
 def evaluate(options: DictConfig) -> dict:
-    stages = ["label", "imitate", "train_instruction", "train_reward", "train_goal", "self_examine"]
-    stage = open_stage(options, "evaluate", ["evaluate"], needs=stages)
+    phases = ["label", "imitate", "train_instruction", "train_reward", "train_goal", "self_examine"]
+    controls = ["continue_imitation", "clone_accepted"]
+    stage = open_stage(options, "evaluate", ["evaluate"], needs=[*phases, *controls])
     if stage.result is not None:
         return stage.result
     run = stage.run

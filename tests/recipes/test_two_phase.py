@@ -64,7 +64,12 @@ def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
     assert all(len(bytes.fromhex(results[name]["outcomes"])) == 7 for name in names)  # 50 scenes
     section = options.self_examine
     frames = section.iterations * section.num_envs * section.steps
-    assert matched_steps(options) == round(frames * (2 * section.epochs + 1 / 3) / 256)
+    rehearsed = frames / section.minibatch * section.epochs * 256
+    samples = frames * (2 * section.epochs + 1 / 3) + rehearsed
+    assert matched_steps(options) == round(samples / 256)
+    for control in ("continue_imitation", "clone_accepted"):
+        history = json.loads((tmp_path / "run" / "metrics" / f"{control}.json").read_text())
+        assert 0 <= history[-1]["selection_return"] <= 1
     [path] = (tmp_path / "results").glob("*.json")
     assert path.name == "move-300-strong-seed0.json"
     assert json.loads(path.read_text())["results"]["cloned"]["outcomes"]

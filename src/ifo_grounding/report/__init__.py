@@ -12,16 +12,15 @@ from ifo_grounding.report.casestudy import (
 from ifo_grounding.report.metrics import read_metrics
 from ifo_grounding.report.page import write_report
 from ifo_grounding.report.plots import (
-    compared_rates,
     confusion,
     figure_png,
     phase_bars,
-    reliability_diagram,
     save_figure,
     success_over_iterations,
     training_curves,
 )
 from ifo_grounding.report.provenance import provenance
+from ifo_grounding.report.rates import compared_rates, reliability_diagram
 from ifo_grounding.report.results import results_rows, results_table
 from ifo_grounding.report.tables import format_cell, markdown_table, text_table
 

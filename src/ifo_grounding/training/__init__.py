@@ -7,6 +7,7 @@ from ifo_grounding.training.held_out import HeldOut
 from ifo_grounding.training.pairs import load_pairs, save_pairs, select_pairs
 from ifo_grounding.training.rehearsal import Rehearsal
 from ifo_grounding.training.run import Run, Stage
+from ifo_grounding.training.selection import Selection, SelectionSchedule
 from ifo_grounding.training.self_examination import SelfExaminationConfig, self_examine
 from ifo_grounding.training.supervised import FitConfig, fit
 
@@ -17,6 +18,8 @@ __all__ = [
     "HeldOut",
     "Rehearsal",
     "Run",
+    "Selection",
+    "SelectionSchedule",
     "SelfExaminationConfig",
     "Stage",
     "accepted",

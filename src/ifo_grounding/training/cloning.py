@@ -5,13 +5,12 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
-from ifo_grounding.training.environment import check_env, reseed
+from ifo_grounding.training.environment import check_env, make_collector, reseed
 
 
 @torch.no_grad()
@@ -43,15 +42,7 @@ def accepted_steps(
     """
     check_env(env)
     policy.eval()
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=env.batch_size.numel() * steps,
-        total_frames=-1,
-        reset_at_each_iter=True,
-        trust_policy=True,
-        auto_register_policy_transforms=False,
-    )
+    collector = make_collector(env, policy, steps)
     batches, kept = iter(collector), []
     for iteration in range(iterations):
         reseed(env, derive(seed, "accepted steps", iteration))

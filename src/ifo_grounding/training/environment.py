@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import nn
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
@@ -24,6 +25,19 @@ def check_env(env: EnvBase) -> None:
     written = [*env.full_reward_spec.keys(True, True), *observed]
     if keys.LEARNED_REWARD not in written:
         raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
+
+
+def make_collector(env: EnvBase, policy: nn.Module, steps: int) -> Collector:
+    """Return a collector of ``steps`` steps of each world per round, each from a reset."""
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=env.batch_size.numel() * steps,
+        total_frames=-1,
+        reset_at_each_iter=True,
+        trust_policy=True,
+        auto_register_policy_transforms=False,
+    )
 
 
 def reseed(env: EnvBase, seed: int) -> None:

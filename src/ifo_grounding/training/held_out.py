@@ -39,6 +39,8 @@ class HeldOut:
     True
     """
 
+    metric = "held_out_loss"
+
     def __init__(self, loss: nn.Module, buffer: ReplayBuffer, batch_size: int = 1024) -> None:
         if not len(buffer):
             raise UserError("there are no held-out samples: hold a larger share out")

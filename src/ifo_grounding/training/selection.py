@@ -121,7 +121,19 @@ class SelectionSchedule:
 
 
 class Selection:
-    """Looks at the policy's learned return from time to time, always from the same starts."""
+    """Measures the learned return, always from the same starts, and keeps the best weights.
+
+    Self-examination asks it from time to time; it also serves :func:`~ifo_grounding.training.fit`
+    as ``held_out``, so that other training can stop by the same rule.
+
+    Args:
+        env: batched; its transforms choose instructions and pay learned rewards.
+        policy: plays greedily.
+        schedule: when to look, and for how long.
+        seed: of the starts.
+    """
+
+    metric = "selection_return"
 
     def __init__(
         self,
@@ -135,19 +147,43 @@ class Selection:
         self.fixed = [t for t in transforms_of(env) if getattr(t, "fixes_scenes", False)]
         self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
 
-    def look(self, done: int) -> Metrics:
+    def after(self, done: int) -> Metrics:
         """Measure and consider the policy after some iterations, if it is time to."""
         schedule = self.schedule
         last = done == schedule.iterations
         if not schedule.every or (done % schedule.every and not last):
             return {}
+        kept, mean = self._consider()
+        return {self.metric: mean, "selected": float(kept)}
+
+    def look(self) -> float:
+        """Return the mean learned return, and remember the weights if it is high enough."""
+        return self._consider()[1]
+
+    def _consider(self) -> tuple[bool, float]:
+        schedule = self.schedule
         present = copy.deepcopy([starts.state_dict() for starts in self.fixed])
         for starts, first in zip(self.fixed, self.first_starts, strict=True):
             starts.load_state_dict(copy.deepcopy(first))
-        reseed(self.env, derive(self.seed, "self-examination", "selection"))
-        returns = learned_returns(self.env, self.policy, schedule.episodes, schedule.max_steps)
+        training = self.policy.training
+        self.policy.eval()
+        with torch.random.fork_rng(devices=[]):
+            reseed(self.env, derive(self.seed, "self-examination", "selection"))
+            returns = learned_returns(self.env, self.policy, schedule.episodes, schedule.max_steps)
+        self.policy.train(training)
         sampler_stats(self.env)
         for starts, state in zip(self.fixed, present, strict=True):
             starts.load_state_dict(state)
-        kept = self.best.consider(returns)
-        return {"selection_return": float(returns.mean()), "selected": float(kept)}
+        return self.best.consider(returns), float(returns.mean())
+
+    def restore(self) -> None:
+        """Give the policy the best weights back."""
+        self.best.restore()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint has to keep."""
+        return self.best.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.best.load_state_dict(state)

@@ -12,7 +12,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
-from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
 from torchrl.objectives.value import GAE
@@ -24,6 +23,7 @@ from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
 from ifo_grounding.training.environment import (
     check_env,
+    make_collector,
     reseed,
     sampler_stats,
     summary,
@@ -93,6 +93,17 @@ class SelfExaminationConfig:
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
 
+    @property
+    def selection(self) -> SelectionSchedule:
+        """When and how the best policy is chosen."""
+        return SelectionSchedule(
+            self.select_every,
+            self.iterations,
+            self.select_episodes,
+            self.max_steps,
+            self.select_margin,
+        )
+
 
 def self_examine(
     env: EnvBase,
@@ -138,18 +149,11 @@ def self_examine(
     value.eval()
     learner = _Learner(env, policy, value, config, rehearsal)
     sampler_stats(env)  # forgets the reset that a collector begins with
-    schedule = SelectionSchedule(
-        config.select_every,
-        config.iterations,
-        config.select_episodes,
-        config.max_steps,
-        config.select_margin,
-    )
-    selection = Selection(env, policy, schedule, seed)
+    selection = Selection(env, policy, config.selection, seed)
     parts: dict[str, Any] = {
         "loss": learner.loss,
         "optimizer": learner.optimizer,
-        "best": selection.best,
+        "best": selection,
     }
     if adversary:
         parts["adversary"] = adversary
@@ -163,7 +167,7 @@ def self_examine(
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
     history: list[Metrics] = state["history"]
     if not state["iteration"]:
-        selection.look(0)
+        selection.after(0)
     from tqdm import tqdm
 
     bar = tqdm(
@@ -183,9 +187,9 @@ def self_examine(
             if adversary:
                 metrics |= adversary(batch)
             done = iteration + 1
-            metrics |= selection.look(done)
+            metrics |= selection.after(done)
             if done == config.iterations:
-                selection.best.restore()
+                selection.restore()
             due = config.evaluate_every and done % config.evaluate_every == 0
             if callback and (due or done == config.iterations):
                 metrics |= callback(done)
@@ -213,15 +217,7 @@ class _Learner:
     ) -> None:
         self.config, self.policy, self.rehearsal = config, policy, rehearsal
         self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl else None
-        self.collector = Collector(
-            env,
-            policy,
-            frames_per_batch=env.batch_size.numel() * config.steps,
-            total_frames=-1,
-            reset_at_each_iter=True,
-            trust_policy=True,
-            auto_register_policy_transforms=False,
-        )
+        self.collector = make_collector(env, policy, config.steps)
         self.batches: Iterator[TensorDictBase] | None = None
         self.advantage = GAE(
             gamma=config.gamma, lmbda=config.lmbda, value_network=value, deactivate_vmap=True

@@ -25,7 +25,9 @@ Log = Callable[[Metrics, int], None]
 
 
 class Validation(Protocol):
-    """Measures a network on held-out samples, and remembers the best weights."""
+    """Measures a network on something else than its loss, and remembers the best weights."""
+
+    metric: str
 
     def look(self) -> float: ...  # noqa: D102
 
@@ -136,8 +138,8 @@ def fit(
         checkpoint_seconds: least time between two checkpoints.
         log: gets the mean metrics of each iteration and the step.
         callback: gets the step, returns further metrics.
-        held_out: measures the loss on held-out samples (``held_out_loss``); the weights that did
-            best there are kept in the end.
+        held_out: measures the loss on held-out samples (``held_out_loss``), or the learned return
+            (``selection_return``); the weights that did best there are kept in the end.
         progress: whether to show a progress bar.
         settings: what else decides the result; a checkpoint made with other settings is refused.
         until: steps after which to pause, rounded up to whole iterations; a later call with the
@@ -166,7 +168,7 @@ def fit(
             done = iteration + 1
             if held_out:
                 if done % config.validate_every == 0 or done == iterations:
-                    metrics["held_out_loss"] = held_out.look()
+                    metrics[held_out.metric] = held_out.look()
                 if done == iterations:
                     held_out.restore()
             due = config.evaluate_every and done % config.evaluate_every == 0
