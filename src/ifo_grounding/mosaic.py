@@ -1,6 +1,6 @@
 """Pictures put together from tiles, one 64-bit word (eight pixels of a row) at a time.
 
-A gather of 64-bit words that writes channels first is several times faster than gathering whole
+Selecting 64-bit words in the order of the picture is several times faster than gathering whole
 tiles and permuting them afterwards.
 """
 
@@ -41,10 +41,14 @@ def assemble(table: Tensor, index: Tensor) -> Tensor:
     >>> assemble(words(tiles), torch.tensor([[0, 1]]))[0, 0].tolist()
     [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
     """
-    _, channels, size, width = table.shape
+    channels, size, width = table.shape[1:]
     *batch, rows, columns = index.shape
-    offset = torch.arange(channels * size * width, device=table.device)
-    offset = offset.view(1, channels, 1, size, 1, width)
-    base = index.reshape(-1, 1, rows, 1, columns, 1).to(torch.int64) * (channels * size * width)
-    pixels = torch.take(table, base + offset).view(torch.uint8)
+    # Where each word comes from: within its channel first, which sums over longer rows than all
+    # axes at once, and with 32 bits where they suffice.
+    kind = torch.int32 if table.numel() < 2**31 else torch.int64
+    tile = index.reshape(-1, rows, 1, columns, 1).to(kind) * (channels * size * width)
+    word = torch.arange(size * width, dtype=kind, device=table.device).view(size, 1, width)
+    plane = torch.arange(channels, dtype=kind, device=table.device) * (size * width)
+    source = (tile + word).flatten(1).unsqueeze(1) + plane.unsqueeze(1)
+    pixels = table.flatten().index_select(0, source.flatten()).view(torch.uint8)
     return pixels.reshape(*batch, channels, rows * size, columns * size)
