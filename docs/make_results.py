@@ -19,7 +19,7 @@ from ifo_grounding.report import (
     save_figure,
 )
 from ifo_grounding.report.results import restored
-from ifo_grounding.stats import Difference, Rate, paired_difference, two_level_bootstrap
+from ifo_grounding.stats import Difference, Rate, holm, paired_difference, two_level_bootstrap
 from ifo_grounding.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
@@ -33,6 +33,9 @@ NAMES = {
 }
 MARKS = ("<!-- results -->", "<!-- /results -->")
 
+Key = tuple[str, int, str]
+"""Of a study: task, demonstrations, preset and variant."""
+
 
 def runs() -> list[dict[str, Any]]:
     """Return all committed results, in the order of the tasks."""
@@ -40,9 +43,9 @@ def runs() -> list[dict[str, Any]]:
     return sorted(found, key=lambda result: TASKS.index(result["options"]["task"]))
 
 
-def studies() -> dict[tuple[str, int, str], list[dict[str, Any]]]:
+def studies() -> dict[Key, list[dict[str, Any]]]:
     """Return the committed seeds of each study: task, demonstrations, preset and variant."""
-    found: dict[tuple[str, int, str], list[dict[str, Any]]] = {}
+    found: dict[Key, list[dict[str, Any]]] = {}
     for path in sorted((ROOT / "results" / "study").glob("*.json")):
         run = read_json(path)
         options = run["options"]
@@ -65,48 +68,130 @@ def outcomes(runs: list[dict[str, Any]], name: str) -> np.ndarray:
 
 def study_section() -> list[str]:
     """Return what the studies over seeds found."""
-    rows, commands = [], []
-    for (task, n, kind), runs in studies().items():
-        both = outcomes(runs, "phase1"), outcomes(runs, "phase2")
-        row = {
-            "task": task,
-            "demonstrations": f"{n:,}",
-            "preset": kind,
-            "seeds": len(runs),
-            "scenes": f"{both[0].shape[1]:,}",
-            "phase 1": brief(two_level_bootstrap(both[0])),
-            "phase 2": brief(two_level_bootstrap(both[1])),
-            "gain, points": brief(paired_difference(*both)),
-        }
-        for name in ("continued", "cloned"):
-            known = all(name in run["results"] for run in runs)
-            row[f"over {name}"] = (
-                brief(paired_difference(outcomes(runs, name), both[1])) if known else "not run"
-            )
-        suitable = [run["results"]["suitability"] for run in runs]
-        row["suitable"] = ", ".join(f"{100 * s['rate']['rate']:.1f}" for s in suitable)
-        row["served"] = ", ".join(f"{100 * s['served']['rate']:.0f}" for s in suitable)
-        rows.append(row)
-        commands += [f"`{run['command']}` (commit `{run['provenance']['commit']}`)" for run in runs]
+    found = {key: runs for key, runs in practised().items() if ", " not in key[2]}
+    rows = [study_row(key, runs) for key, runs in found.items()]
     if not rows:
         return []
+    for row, p_value in zip(rows, adjusted(found), strict=True):
+        row["p"] = p_value
     return [
         "## Studies",
         "Several training seeds each; greedy success on the same evaluation scenes in percent, with"
         " 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired by"
-        " scene. `continued` and `cloned` are the [controls](phase2.md#controls). The last two"
-        " columns hold each seed's share of suitable instructions among those chosen, and of"
-        " states served.",
+        " scene. `continued` and `cloned` are the [controls](phase2.md#controls). The columns"
+        " before the last hold each seed's share of suitable instructions among those chosen, and"
+        " of states served. p is that of no gain, corrected (Holm) for the tasks with as many"
+        " demonstrations.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table(rows),
-        "\n".join(f"- {command}" for command in commands),
+        commands(found),
     ]
+
+
+def variant_section() -> list[str]:
+    """Return what was compared of phase 2 on validation or evaluation scenes."""
+    found = {key: runs for key, runs in practised().items() if ", " in key[2]}
+    rows = [study_row(key, runs, scenes=True) for key, runs in found.items()]
+    if not rows:
+        return []
+    return [
+        "## Variants of phase 2",
+        "What else was tried, from the same phase 1; the pages of the phases say why it does what"
+        " it does.",
+        markdown_table(rows),
+        commands(found),
+    ]
+
+
+def module_section() -> list[str]:
+    """Return what was compared of the instruction module alone."""
+    found = {key: runs for key, runs in studies().items() if "phase2" not in runs[0]["results"]}
+    rows = []
+    for (task, n, kind), runs in found.items():
+        for run in runs:
+            suitability = run["results"]["suitability"]
+            rows.append(
+                {
+                    "task": task,
+                    "demonstrations": f"{n:,}",
+                    "instruction module": kind.rpartition(", ")[2],
+                    "seed": run["options"]["seed"],
+                    "scenes": run["options"]["evaluate"]["stream"],
+                    "suitable": brief(restored(Rate, suitability["rate"])),
+                    "served": brief(restored(Rate, suitability["served"])),
+                }
+            )
+    if not rows:
+        return []
+    return [
+        "## Instruction modules",
+        "Suitable instructions among those chosen, and states served, by ways to train the"
+        " [instruction module](phase2.md#the-instruction-module) from the same phase 1.",
+        markdown_table(rows),
+        commands(found),
+    ]
+
+
+def practised() -> dict[Key, list[dict[str, Any]]]:
+    """Return the studies whose policy has practised."""
+    return {key: runs for key, runs in studies().items() if "phase2" in runs[0]["results"]}
+
+
+def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dict[str, Any]:
+    """Compare the policies of one study over its seeds."""
+    task, n, kind = key
+    both = outcomes(runs, "phase1"), outcomes(runs, "phase2")
+    stream = f" {runs[0]['options']['evaluate']['stream']}" if scenes else ""
+    row = {
+        "task": task,
+        "demonstrations": f"{n:,}",
+        "preset": kind,
+        "seeds": len(runs),
+        "scenes": f"{both[0].shape[1]:,}{stream}",
+        "phase 1": brief(two_level_bootstrap(both[0])),
+        "phase 2": brief(two_level_bootstrap(both[1])),
+        "gain, points": brief(paired_difference(*both)),
+    }
+    for name in ("continued", "cloned"):
+        known = all(name in run["results"] for run in runs)
+        row[f"over {name}"] = (
+            brief(paired_difference(outcomes(runs, name), both[1])) if known else "not run"
+        )
+    suitable = [run["results"]["suitability"] for run in runs]
+    row["suitable"] = ", ".join(f"{100 * s['rate']['rate']:.1f}" for s in suitable)
+    row["served"] = ", ".join(f"{100 * s['served']['rate']:.0f}" for s in suitable)
+    return row
+
+
+def adjusted(found: dict[Key, list[dict[str, Any]]]) -> list[str]:
+    """Return the p-value of each study's gain, corrected for all with as many demonstrations."""
+    groups: dict[tuple[int, str], list[Key]] = {}
+    for key in found:
+        groups.setdefault(key[1:], []).append(key)
+    corrected = {}
+    for members in groups.values():
+        tests = [
+            paired_difference(outcomes(found[key], "phase1"), outcomes(found[key], "phase2"))
+            for key in members
+        ]
+        corrected |= dict(zip(members, holm([test.p_value for test in tests]), strict=True))
+    return [f"{corrected[key]:.2g}" for key in found]
+
+
+def commands(found: dict[Key, list[dict[str, Any]]]) -> str:
+    """Return by what each result was made, folded away."""
+    made = [
+        f"- `{run['command']}` (commit `{run['provenance']['commit']}`)"
+        for runs in found.values()
+        for run in runs
+    ]
+    return "\n".join(['??? note "Commands"', "", *(f"    {line}" for line in made)])
 
 
 def study_picture() -> Figure:
     """Draw what the studies compare."""
     groups = {}
-    for (task, n, kind), runs in studies().items():
+    for (task, n, kind), runs in practised().items():
         known = [name for name in NAMES if all(name in run["results"] for run in runs)]
         title = f"{task}, {n:,} demonstrations, {kind}, seeds: {len(runs)}"
         groups[title] = {NAMES[name]: two_level_bootstrap(outcomes(runs, name)) for name in known}
@@ -156,7 +241,7 @@ def page(found: list[dict[str, Any]]) -> str:
         " preset `strong`, which flattened its feature map; see the changelog. They have not been"
         " repeated with the present one.",
     ]
-    parts += study_section()
+    parts += [*study_section(), *variant_section(), *module_section()]
     for run in found:
         made = run["provenance"]
         parts += [

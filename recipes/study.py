@@ -19,12 +19,13 @@ from ifo_grounding.report.audit import PANELS
 
 def study(options: DictConfig) -> dict:
     train_phases(options)
-    if options.controls.run:
+    if options.practise and options.controls.run:
         continue_imitation(options)
         clone_accepted(options)
     results = evaluate(options)
     content = write_result(options, results, "run study")
-    content["audit"] = audit(options)
+    if options.practise:
+        content["audit"] = audit(options)
     folder = options.results
     if folder:
         parts = [options.task, options.demonstrations.n, options.network, options.variant]

@@ -34,6 +34,8 @@ def train_instruction(options: DictConfig) -> dict:
         removal_rate=options.instruction.removal_rate,
         warmup=options.instruction.removal_warmup,
         contrast=options.instruction.contrast,
+        unlabelled=options.instruction.unlabelled,
+        near=options.instruction.near,
     )
     calibrate = loss.calibrate if options.instruction.removal_rate == "estimated" else None
     buffer = first_frame_buffer(demos)

@@ -56,7 +56,8 @@ def train_phases(options: DictConfig) -> None:
         train_reward(options)
     if options.self_examine.kind != "action":
         train_goal(options)
-    examine(options)
+    if options.practise:
+        examine(options)
 
 
 def write_result(options: DictConfig, results: dict, command: str) -> dict:

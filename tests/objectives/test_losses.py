@@ -153,6 +153,41 @@ def test_the_likeliest_negatives_are_removed_after_the_warm_up():
     assert float(grad[2]) == pytest.approx(-(1 - 0.6) / 4 + 0.6 / 2, rel=1e-4)
 
 
+def test_the_non_negative_risk_takes_the_share_of_positives_off_by_hand():
+    pool = torch.tensor([[1, 0], [2, 0]])
+    data = TensorDict({"pixels": torch.zeros(2, 1), "instruction": pool}, [2])
+
+    def loss_of(probabilities, share, progress=1.0):
+        network = suitability(probabilities)
+        loss = InstructionLoss(network, pool, removal_rate=share, unlabelled="non-negative")
+        loss.set_progress(progress)
+        return loss(data)
+
+    as_positive = -(math.log(0.9) + math.log(0.6)) / 2
+    as_negative = -(math.log(0.1) + math.log(0.4)) / 2  # the same pairs, once as the other's
+    out = loss_of([0.9, 0.6], 0.25)
+    true_negatives = (as_negative - 0.25 * as_negative) / 0.75
+    expected = (as_positive + true_negatives) / 2
+    assert out["loss_instruction"].item() == pytest.approx(expected, rel=1e-5)
+    assert float(out["removed"]) == 0
+    # Before the end of the warm-up the share counts as zero.
+    early = loss_of([0.9, 0.6], 0.25, progress=0.0)["loss_instruction"].item()
+    assert early == pytest.approx((as_positive + as_negative) / 2, rel=1e-5)
+
+
+def test_a_risk_below_zero_is_turned_round():
+    own, other = torch.full((4,), 3.0), torch.full((4, 2), -3.0, requires_grad=True)
+    loss = InstructionLoss(
+        suitability([0.5, 0.5]), POOL, removal_rate=0.4, unlabelled="non-negative"
+    )
+    risk = loss._non_negative(own, other)
+    plain = (math.log1p(math.exp(-3)) - 0.4 * math.log1p(math.exp(3))) / 0.6
+    assert plain < 0
+    assert risk.item() == pytest.approx(-plain, rel=1e-5)
+    risk.backward()
+    assert (other.grad < 0).all()  # a step of descent raises what was pushed down too far
+
+
 def test_halves_and_whole_networks_give_the_same_loss():
     loss = make_loss("instruction", "strong", removal_rate=0.3)
     whole = TensorDictModule(

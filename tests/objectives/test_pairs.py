@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.objectives import InstructionLoss, NegativeInstructions, RewardLoss
+from ifo_grounding.objectives import InstructionLoss, NegativeInstructions, RewardLoss, pairs
 from objectives.conftest import LOSSES, POOL, SHAPES
 
 
@@ -53,6 +53,28 @@ def test_the_top_share_is_dropped(rate, count, dropped):
         assert scores[~kept].min() > scores[kept].max()
 
 
+def test_near_negatives_differ_in_few_words(monkeypatch):
+    words = torch.cartesian_prod(*[torch.arange(1, 4)] * 4)  # 81 sentences of four words
+    monkeypatch.setattr(pairs, "NEAREST", 8)
+    negatives = NegativeInstructions(words, 0.0, near=0.5)
+    drawn = negatives.draw(words, 10)
+    differing = (drawn != words.unsqueeze(1)).sum(-1)
+    assert drawn.shape == (81, 10, 4)
+    assert differing.min() == 1  # never the own one
+    assert (differing[:, 5:] == 1).all()  # 4 places, 2 other words each
+    assert differing[:, :5].float().mean() > 2
+    assert negatives.uniform(10) == 5
+
+
+def test_the_share_is_estimated_from_uniform_negatives_alone():
+    negatives = NegativeInstructions(POOL, "estimated", near=0.5)
+    likely = torch.full((4000,), 5.0)
+    other = torch.full((4000, 4), -5.0)
+    other[:, 2:] = 5.0  # the near ones
+    negatives.watch(likely, other)
+    assert negatives.removal_rate == 0.0
+
+
 def test_nothing_scored_nothing_dropped():
     assert NegativeInstructions(POOL, 0.3).keep(torch.zeros(0)).shape == (0,)
 
@@ -66,6 +88,8 @@ def test_nothing_scored_nothing_dropped():
         (POOL, {"removal_rate": 1.0}, "removal_rate"),
         (POOL, {"negatives": 0}, "negatives"),
         (POOL, {"contrast": -1.0}, "contrast"),
+        (POOL, {"near": 1.0}, "near"),
+        (POOL, {"unlabelled": "ignored"}, "treatment of unlabelled"),
     ],
 )
 def test_impossible_negatives_are_refused(pool, options, message):

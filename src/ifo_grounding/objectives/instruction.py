@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import (
     ESTIMATED,
@@ -23,6 +23,7 @@ from ifo_grounding.objectives.pairs import (
     pair_scores,
 )
 
+UNLABELLED = ("removal", "non-negative")
 LEAST_SHARE = 1e-4
 """Shares of suitable pairs below this cannot be told from none."""
 
@@ -53,6 +54,11 @@ class InstructionLoss(SupervisedLoss):
             ``"estimated"``, as large as their scores say that the share of suitable ones is.
         warmup: share of training before which none is removed; see :meth:`set_progress`.
         contrast: weight of the contrast, in nats.
+        unlabelled: what is done about false negatives. ``"removal"`` drops the negatives scored
+            highest; ``"non-negative"`` drops none, but takes the share's worth of the positives'
+            loss off the negatives' loss, which is kept from falling below zero (nnPU, Kiryo et al.
+            2017, with both classes weighing the same).
+        near: share of the negatives that differ from the own instruction in few words.
         generator: where random numbers come from; None is the global generator.
 
     Raises:
@@ -89,6 +95,8 @@ class InstructionLoss(SupervisedLoss):
         removal_rate: float | str = ESTIMATED,
         warmup: float = 1 / 3,
         contrast: float = 0.0,
+        unlabelled: str = "removal",
+        near: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
@@ -96,8 +104,9 @@ class InstructionLoss(SupervisedLoss):
             raise UserError(f"negatives must be at least 1, got {negatives}")
         if contrast < 0:
             raise UserError(f"contrast is a weight of at least 0, got {contrast}")
-        self.contrast = contrast
-        self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator)
+        check_choice("treatment of unlabelled pairs", unlabelled, UNLABELLED)
+        self.contrast, self.unlabelled = contrast, unlabelled
+        self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator, near)
         self.count = min(negatives, len(self.negatives.pool) - 1)
 
     def set_progress(self, fraction: float) -> None:
@@ -135,8 +144,13 @@ class InstructionLoss(SupervisedLoss):
         with self._mode():
             own, other = pair_scores(self.network, batch, others)
         self.negatives.watch(own, other)
-        kept = self.negatives.keep(other)
-        loss = (F.softplus(-own).mean() + masked_mean(F.softplus(other), kept)) / 2
+        if self.unlabelled == "removal":
+            kept = self.negatives.keep(other)
+            refused = masked_mean(F.softplus(other), kept)
+        else:
+            kept = torch.ones_like(other, dtype=torch.bool)
+            refused = self._non_negative(own, other)
+        loss = (F.softplus(-own).mean() + refused) / 2
         if self.contrast:
             logits = torch.cat([own.unsqueeze(1), other.masked_fill(~kept, -torch.inf)], 1)
             loss = loss + self.contrast * (logits.logsumexp(1) - own).mean()
@@ -146,3 +160,9 @@ class InstructionLoss(SupervisedLoss):
             negative_probability=self._mean(other.sigmoid()),
             removed=1 - self._mean(kept),
         )
+
+    def _non_negative(self, own: Tensor, other: Tensor) -> Tensor:
+        """Estimate the loss of true negatives from that of unlabelled pairs and of positives."""
+        share = self.negatives.share
+        risk = (F.softplus(other).mean() - share * F.softplus(own).mean()) / (1 - share)
+        return risk.abs()  # where it falls below zero, its gradient is turned round

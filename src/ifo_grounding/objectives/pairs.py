@@ -17,6 +17,9 @@ LEAST_REMOVED = 0.05
 """Where fewer pairs than this are suitable, false negatives hardly matter, and what an imperfect
 classifier would remove are mostly the hardest true ones."""
 
+NEAREST = 64
+"""How many instructions count as near in their words."""
+
 
 class NegativeInstructions(nn.Module):
     """Draws instructions from a pool that differ from a given one, and removes likely mistakes.
@@ -30,10 +33,13 @@ class NegativeInstructions(nn.Module):
         pool: token ids [P, L]; repeated rows count once.
         removal_rate: share of negatives to drop, in [0, 1), or ``"estimated"``.
         warmup: share of training before which none is dropped.
+        near: share of the negatives that are drawn among the ``NEAREST`` instructions of the pool
+            that differ from the given one in the fewest words, instead of among all.
         generator: where random numbers come from; None is the global generator.
 
     Raises:
-        UserError: where the pool holds fewer than two different instructions.
+        UserError: where the pool holds fewer than two different instructions, or values are out of
+            range.
 
     >>> negatives = NegativeInstructions(torch.tensor([[1, 0], [2, 0], [2, 0]]), removal_rate=0.5)
     >>> negatives.draw(torch.tensor([[1, 0], [2, 0]]), 1).tolist()
@@ -50,8 +56,11 @@ class NegativeInstructions(nn.Module):
         removal_rate: float | str,
         warmup: float = 1 / 3,
         generator: torch.Generator | None = None,
+        near: float = 0.0,
     ) -> None:
         super().__init__()
+        if not 0 <= near < 1:
+            raise UserError(f"near is a share in [0, 1), got {near}")
         if pool.ndim != 2 or pool.dtype.is_floating_point:
             raise UserError(f"pool must be token ids [P, L], got {pool.dtype} {list(pool.shape)}")
         estimated = removal_rate == ESTIMATED
@@ -65,12 +74,24 @@ class NegativeInstructions(nn.Module):
         self.register_buffer("pool", distinct, persistent=False)
         self.removal_rate = 0.0 if estimated else float(removal_rate)
         self.estimate = MixtureEstimate() if estimated else None
-        self.warmup = warmup
+        self.warmup, self.near = warmup, near
         self.generator = generator
         self.progress = 1.0
 
     def draw(self, instruction: Tensor, count: int) -> Tensor:
-        """Draw ``count`` instructions per row of [N, L], each uniform among all others: [N, K, L].
+        """Draw ``count`` instructions per row of [N, L], other than the row's own: [N, K, L]."""
+        uniform = self.uniform(count)
+        drawn = self._among_all(instruction, uniform)
+        if uniform == count:
+            return drawn
+        return torch.cat([drawn, self._nearby(instruction, count - uniform)], 1)
+
+    def uniform(self, count: int) -> int:
+        """Return how many of ``count`` drawn instructions, the first ones, are from all others."""
+        return max(1, round((1 - self.near) * count))
+
+    def _among_all(self, instruction: Tensor, count: int) -> Tensor:
+        """Draw uniformly among all others.
 
         A draw that hits the row's own instruction is moved on by a random number of places, which
         keeps it uniform, for the rows of the pool are distinct.
@@ -82,16 +103,29 @@ class NegativeInstructions(nn.Module):
         same = (self.pool[index] == instruction.unsqueeze(1)).all(-1)
         return self.pool[torch.where(same, moved, index)]
 
+    def _nearby(self, instruction: Tensor, count: int) -> Tensor:
+        """Draw uniformly among the nearest others."""
+        differing = torch.stack([(self.pool != row).sum(-1) for row in instruction])
+        differing = torch.where(differing == 0, self.pool.shape[1] + 1, differing)
+        nearest = differing.topk(min(NEAREST, len(self.pool) - 1), largest=False).indices
+        chosen = self._randint(0, nearest.shape[1], (len(instruction), count))
+        return self.pool[nearest.gather(1, chosen)]
+
     def watch(self, own: Tensor, other: Tensor) -> None:
-        """Learn the share of suitable negatives from scores of positives [N] and negatives [M]."""
+        """Learn the share of suitable ones from scores of positives [N] and negatives [*, K]."""
         if self.estimate is not None:
-            self.estimate.add(own, other)
+            self.estimate.add(own, other[..., : self.uniform(other.shape[-1])])
             share = min(self.estimate.share(), MOST_REMOVED)
             self.removal_rate = share if share >= LEAST_REMOVED else 0.0
 
+    @property
+    def share(self) -> float:
+        """Share of suitable negatives, as far as it is to be heeded by now."""
+        return self.removal_rate if self.progress >= self.warmup else 0.0
+
     def keep(self, scores: Tensor) -> Tensor:
         """Return a mask of ``scores`` [*] without the top share that is likely suitable."""
-        drop = int(self.removal_rate * scores.numel()) if self.progress >= self.warmup else 0
+        drop = int(self.share * scores.numel())
         mask = torch.ones(scores.numel(), dtype=torch.bool, device=scores.device)
         mask[scores.detach().flatten().topk(drop).indices] = False
         return mask.reshape(scores.shape)
