@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import math
+
 import torch
 from torch import Tensor
 
@@ -36,7 +39,8 @@ def step(state: WorldState, action: Tensor) -> WorldState:
 
     Args:
         state: worlds [*B].
-        action: 0..5 for up, right, down, left, pick or place, stop; int64 [*B].
+        action: 0..5 for up, right, down, left, pick or place, stop; int64 [*B]. Others are refused
+            by an ``IndexError``, or not at all.
 
     Returns:
         New worlds [*B]; the given ones stay as they were.
@@ -46,12 +50,26 @@ def step(state: WorldState, action: Tensor) -> WorldState:
     tensor([6])
     """
     arm, held, objects = state.arm, state.held, state.objects
-    arm = neighbour(arm, action, state.size)[0]
+    cells = objects.shape[-1]
+    places = _destinations(math.isqrt(cells), arm.device)
+    arm = places.index_select(0, torch.add(arm, action, alpha=cells).flatten()).view(arm.shape)
     here = arm.unsqueeze(-1)
     under = objects.gather(-1, here).squeeze(-1)
-    reaches = (action == PICK_PLACE) & ((held == 0) != (under == 0))
-    objects = objects.scatter(-1, here, torch.where(reaches, held, under).unsqueeze(-1))
-    held = torch.where(reaches, under, held)
+    # What is held and what lies there change places, unless both are objects.
+    reaches = (action == PICK_PLACE) & (torch.minimum(held, under) == 0)
+    swapped = (held ^ under) * reaches
     return WorldState(
-        arm=arm, held=held, objects=objects, boxes=state.boxes, batch_size=state.batch_size
+        arm=arm,
+        held=held ^ swapped,
+        objects=objects.scatter(-1, here, (under ^ swapped).unsqueeze(-1)),
+        boxes=state.boxes,
+        batch_size=state.batch_size,
     )
+
+
+@functools.lru_cache(maxsize=64)
+def _destinations(size: int, device: torch.device) -> Tensor:
+    """Return the cell that each action leads to from each cell, int64 [6 * size * size]."""
+    cells = torch.arange(size * size, device=device)
+    led = [neighbour(cells, torch.full_like(cells, action), size)[0] for action in range(STOP + 1)]
+    return torch.cat(led)

@@ -96,7 +96,8 @@ def tile_table(tile_size: int = 8) -> Tensor:
 
 @functools.cache
 def _words(tile_size: int, device: str) -> Tensor:
-    return mosaic.words(tile_table(tile_size)).to(device)
+    words = mosaic.words(tile_table(tile_size)).to(device)
+    return words.permute(1, 2, 0, 3).contiguous().permute(2, 0, 1, 3)  # as it is gathered from
 
 
 def _look(kind: int) -> tuple[str, tuple[int, int, int]]:

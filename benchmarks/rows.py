@@ -1,0 +1,305 @@
+"""What is measured: each function builds one row of the table."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+from measuring import Peer, Row, timed
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+
+from ifo_grounding import keys, networks
+from ifo_grounding.data import (
+    collect_transitions,
+    label_demonstrations,
+    labelled_buffer,
+    record_demonstrations,
+)
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.objectives import ImitationLoss
+from ifo_grounding.tasks import grammar
+from ifo_grounding.training import FitConfig, fit
+from ifo_grounding.transforms import InstructionSampler
+from ifo_grounding.world import random_layout, render, step, tile_index, tile_table
+
+DEVICE = "cpu"
+PRESETS = ("strong", "paper")
+
+
+def finish() -> None:
+    """Wait for the device, so that time is that of work done and not of work asked for."""
+    if DEVICE.startswith("cuda"):
+        torch.cuda.synchronize()
+
+
+def ours(work: Callable[[], float]) -> dict:
+    def finished() -> float:
+        done = work()
+        finish()
+        return done
+
+    return {"ifo-grounding": timed(finished)}
+
+
+def world_step() -> Row:
+    batch, steps = 4096, 200
+    first = random_layout(batch, device=DEVICE)
+    actions = torch.randint(6, (steps, batch), device=DEVICE)
+
+    def work() -> float:
+        state = first
+        for action in actions:
+            state = step(state, action)
+        return batch * steps
+
+    peer = Peer("navix")
+    return Row(
+        "world step, batch 4,096",
+        "steps/s",
+        {**ours(work), **peer.contender("step")},
+        {"rate": 25e6, "navix": 4},
+        "navix: an empty room of 6x6 cells, which holds no objects",
+        peers=[peer],
+    )
+
+
+def world_pixels() -> Row:
+    batch, steps = 1024, 40
+    first = random_layout(batch, device=DEVICE)
+    actions = torch.randint(6, (steps, batch), device=DEVICE)
+    table = tile_table().to(DEVICE)
+
+    def play(draw: Callable) -> float:
+        state = first
+        for action in actions:
+            state = step(state, action)
+            draw(state)
+        return batch * steps
+
+    def naive(state) -> torch.Tensor:
+        tiles = table[tile_index(state)]  # [N, rows, columns, C, T, T]
+        return tiles.permute(0, 3, 1, 4, 2, 5).reshape(batch, 3, 48, 48)
+
+    frames = render(first)
+    assert torch.equal(frames, naive(first))
+    peers = Peer("navix"), Peer("minigrid")
+    return Row(
+        "step and pixels, batch 1,024",
+        "frames/s",
+        {
+            **ours(lambda: play(render)),
+            "whole tiles permuted": timed(lambda: play(naive)),
+            "a copy of the frames": timed(lambda: play(lambda state: frames.clone())),
+            **peers[0].contender("pixels"),
+            **peers[1].contender("pixels"),
+        },
+        {"rate": 1e6, "navix": 3, "minigrid": 400},
+        "48x48 pixels here and in MiniGrid, 192x192 in navix, whose tiles are fixed",
+        peers=list(peers),
+    )
+
+
+def env_rollout() -> Row:
+    batch, steps = 1024, 20
+    env = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
+    bare = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
+
+    def rollout() -> float:
+        env.rollout(steps, break_when_any_done=False)
+        return batch * steps
+
+    def simulate() -> float:
+        rows = torch.arange(batch, device=DEVICE)
+        bare.simulator.reset(rows)
+        for action in torch.randint(6, (steps, batch), device=DEVICE):
+            _, terminated, truncated = bare.simulator.step(action)
+            bare.simulator.pixels()
+            ended = (terminated | truncated).nonzero().squeeze(-1)
+            if len(ended):
+                bare.simulator.reset(ended)
+                bare.simulator.pixels(ended)
+        return batch * steps
+
+    return Row(
+        "PickAndPlaceEnv.rollout with resets, batch 1,024",
+        "frames/s",
+        {**ours(rollout), "without TensorDict": timed(simulate)},
+        {"rate": 400e3},
+        "a random policy, which ends every sixth episode at each step",
+    )
+
+
+def gymnasium_vector() -> Row:
+    batch, steps = 1024, 20
+    env = gymnasium.make_vec("ifo_grounding/Move-v0", num_envs=batch, device=DEVICE)
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).integers(6, size=(steps, batch))
+
+    def work() -> float:
+        for action in actions:
+            env.step(action)
+        return batch * steps
+
+    peer = Peer("minigrid")
+    return Row(
+        "Gymnasium vector env, 1,024 worlds",
+        "frames/s",
+        {**ours(work), **peer.contender("vector")},
+        {"rate": 300e3},
+        "MiniGrid: SyncVectorEnv of 64 worlds, whose rate does not depend on their number",
+        peers=[peer],
+    )
+
+
+def collector(preset: str) -> Row:
+    batch, steps = (1024, 20) if preset == "strong" else (512, 10)
+    env = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
+    policy = networks.make_policy(env, preset, seed=0, device=DEVICE)
+    source = Collector(
+        env,
+        policy,
+        frames_per_batch=batch * steps,
+        total_frames=-1,
+        trust_policy=True,
+        auto_register_policy_transforms=False,
+    )
+    batches = iter(source)
+    seen = next(batches).select(keys.PIXELS, keys.INSTRUCTION).unbind(1)
+
+    def collect() -> float:
+        next(batches)
+        return batch * steps
+
+    @torch.no_grad()
+    def infer() -> float:
+        for state in seen:
+            policy(state.copy())
+        return batch * steps
+
+    return Row(
+        f"Collector, preset {preset}",
+        "frames/s",
+        {**ours(collect), "the policy alone": timed(infer)},
+        {"the policy alone": 0.8},
+        "the policy alone: on the same observations",
+    )
+
+
+def sampler() -> Row:
+    batch, sentences, candidates = 512, 500, 64
+    world = PickAndPlaceEnv("pick-out", num_envs=batch, seed=0, device=DEVICE, instructed=False)
+    pool = some_sentences("pick-out", sentences)
+    classifier = networks.make_instruction_classifier(world, "strong", seed=0, device=DEVICE)
+    # Accepts every candidate, so that a reset scores as many pairs as the bare network does.
+    chooser = InstructionSampler(
+        classifier, pool, threshold=0.0, candidates=candidates, choose="best"
+    )
+    env = TransformedEnv(world, chooser)
+    pixels = world.reset()[keys.PIXELS]
+
+    @torch.no_grad()
+    def score() -> float:
+        for rows in torch.arange(batch, device=DEVICE).split(128):
+            index = torch.randint(sentences, (len(rows), candidates), device=DEVICE)
+            words = classifier.encode_instruction(pool)
+            classifier.score_candidates(classifier.encode_scenes(pixels[rows]), words, index)
+        return batch * candidates
+
+    def reset() -> float:
+        env.reset()
+        return batch * candidates
+
+    return Row(
+        "reset with InstructionSampler, pool of 500",
+        "pairs/s",
+        {**ours(reset), "the classifier alone": timed(score)},
+        {"the classifier alone": 0.7},
+    )
+
+
+def imitation(preset: str) -> Row:
+    size, steps = (512, 6) if preset == "paper" else (256, 20)
+    demos, _ = record_demonstrations("move", 2000, seed=0, keep_truth=True)
+    # How fast a network learns does not depend on the labels; these are random.
+    actions = torch.randint(6, (demos.transitions,), dtype=torch.uint8)
+    buffer = labelled_buffer(demos, actions)
+    policy = networks.make_policy(demos, preset, seed=0, device=DEVICE)
+    config = FitConfig(steps=steps, batch_size=size, iteration=steps, schedule="constant")
+
+    def work() -> float:
+        fit(ImitationLoss(policy), buffer, config, seed=0)
+        return size * steps
+
+    if preset == "strong":
+        return Row("imitation, preset strong", "samples/s", ours(work), {"rate": 16e3})
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "data.npz"
+        batch = buffer.sample(4096)
+        np.savez(
+            path, **{name: batch[name].numpy() for name in ("pixels", "instruction", "action")}
+        )
+        peer = Peer("imitation", str(path), str(size), str(steps), str(torch.get_num_threads()))
+    return Row(
+        "imitation, preset paper, batch 512",
+        "samples/s",
+        {**ours(work), **peer.contender("train")},
+        {"rate": 30e3, "imitation": 5},
+        "the package imitation: BC with the same network, data and batch size",
+        peers=[peer],
+    )
+
+
+def labelling() -> Row:
+    demos, _ = record_demonstrations("move", 4000, seed=0, keep_truth=True)
+    inverse = networks.make_inverse(demos, "strong", seed=0, device=DEVICE)
+
+    def work() -> float:
+        label_demonstrations(inverse, demos)
+        return demos.transitions
+
+    return Row("labelling of demonstrations", "pairs/s", ours(work), {"rate": 60e3})
+
+
+def random_steps() -> Row:
+    env = PickAndPlaceEnv("pick", num_envs=256, seed=0, device=DEVICE, instructed=False)
+
+    def work() -> float:
+        collect_transitions(env, 20_000, seed=0)
+        return 20_000
+
+    return Row("collect_transitions", "transitions/s", ours(work))
+
+
+def recording() -> Row:
+    def work() -> float:
+        return record_demonstrations("pick", 5000, seed=0).n_frames
+
+    return Row("record_demonstrations, pick", "frames/s", ours(work))
+
+
+def some_sentences(task: str, count: int) -> torch.Tensor:
+    """Return token ids of different sentences of a task, [count, 16]."""
+    demos = record_demonstrations(task, 3 * count, seed=0)
+    pool = demos.pool()
+    assert len(pool) >= count, f"{task} has {len(pool)} sentences: {grammar(task)}"
+    return pool[:count].to(DEVICE)
+
+
+ROWS: dict[str, Callable[[], Row]] = {
+    "step": world_step,
+    "pixels": world_pixels,
+    "rollout": env_rollout,
+    "gymnasium": gymnasium_vector,
+    **{f"collector-{preset}": functools.partial(collector, preset) for preset in PRESETS},
+    "sampler": sampler,
+    **{f"imitation-{preset}": functools.partial(imitation, preset) for preset in PRESETS},
+    "labelling": labelling,
+    "transitions": random_steps,
+    "recording": recording,
+}
