@@ -7,7 +7,7 @@ DEV := .venv/.installed-dev
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-slow lint types docs format wheel clean
+.PHONY: help demo test test-slow bench lint types docs format wheel clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -20,6 +20,15 @@ test: $(DEV) ## all fast tests, doctests and examples of the docs; line coverage
 
 test-slow: $(DEV) ## tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) -m slow --timeout 3600 $(ARGS)
+
+bench: $(DEV) ## speed of every part beside peers, in under ten minutes (ARGS="pixels step")
+	for peer in navix minigrid imitation; do \
+	  test -e .venv-peers/$$peer/.installed || { \
+	    $(PYTHON) -m venv .venv-peers/$$peer && \
+	    .venv-peers/$$peer/bin/pip install --quiet -r benchmarks/peers/$$peer.txt && \
+	    touch .venv-peers/$$peer/.installed; } || echo "$$peer cannot be installed here"; \
+	done
+	$(BIN)/python benchmarks/run.py --out results/bench/cpu.json $(ARGS)
 
 lint: $(DEV) ## style
 	$(BIN)/ruff check

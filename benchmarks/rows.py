@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import functools
+import json
+import subprocess
+import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import torch
-from measuring import Peer, Row, timed
+from measuring import Peer, Row, median_time, peak_memory, resident_memory, timed
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
 from ifo_grounding import keys, networks
 from ifo_grounding.data import (
+    Demonstrations,
     collect_transitions,
     label_demonstrations,
     labelled_buffer,
@@ -26,7 +31,7 @@ from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import grammar
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.transforms import InstructionSampler
-from ifo_grounding.world import random_layout, render, step, tile_index, tile_table
+from ifo_grounding.world import Layout, random_layout, render, step, tile_index, tile_table
 
 DEVICE = "cpu"
 PRESETS = ("strong", "paper")
@@ -283,6 +288,73 @@ def recording() -> Row:
     return Row("record_demonstrations, pick", "frames/s", ours(work))
 
 
+def memory() -> Row:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "demonstrations"
+        record_demonstrations("pick", 80_000, seed=0).save(path)
+        here = subprocess.run(
+            [sys.executable, __file__, str(path)], stdout=subprocess.PIPE, text=True, check=True
+        )
+    return Row(
+        "80,000 demonstrations of pick",
+        "MB",
+        {},
+        note="resident memory that they add, and that imitating them adds (preset strong)",
+        facts=json.loads(here.stdout.splitlines()[-1]),
+    )
+
+
+def remember(path: str) -> dict[str, float]:
+    """Load demonstrations and imitate them, and say what that takes."""
+    start = resident_memory()
+    demos = Demonstrations.load(path)
+    loaded = resident_memory()
+    actions = torch.randint(6, (demos.transitions,), dtype=torch.uint8)
+    policy = networks.make_policy(demos, "strong", seed=0)
+    config = FitConfig(steps=100, batch_size=256, iteration=50)
+    fit(ImitationLoss(policy), labelled_buffer(demos, actions), config, seed=0)
+    return {
+        "frames": demos.n_frames,
+        "MB as pixels": round(demos.n_frames * 3 * 48 * 48 / 2**20),
+        "MB resident": round(loaded - start),
+        "MB added by training": round(peak_memory() - loaded),
+    }
+
+
+def growth() -> Row:
+    def play(batch: int, size: int) -> Callable[[], object]:
+        state = random_layout(batch, Layout(size=size), device=DEVICE)
+        action = torch.randint(6, (batch,), device=DEVICE)
+
+        def work() -> None:
+            render(step(state, action))
+            finish()
+
+        return work
+
+    batches = [4**power for power in range(9)]
+    counts = [1000, 10_000, 100_000, 1_000_000]
+
+    def record(count: int) -> float:
+        start = time.perf_counter()
+        record_demonstrations("move", count, seed=0)
+        return time.perf_counter() - start
+
+    record(1000)
+    return Row(
+        "growth",
+        "s",
+        {},
+        curves={
+            "step and pixels, by batch": {n: median_time(play(n, 6), 5) for n in batches},
+            "step and pixels of 1,024, by cells": {
+                n * n: median_time(play(1024, n), 5) for n in range(6, 11)
+            },
+            "recording, by demonstrations of move": {n: record(n) for n in counts},
+        },
+    )
+
+
 def some_sentences(task: str, count: int) -> torch.Tensor:
     """Return token ids of different sentences of a task, [count, 16]."""
     demos = record_demonstrations(task, 3 * count, seed=0)
@@ -302,4 +374,9 @@ ROWS: dict[str, Callable[[], Row]] = {
     "labelling": labelling,
     "transitions": random_steps,
     "recording": recording,
+    "memory": memory,
+    "growth": growth,
 }
+
+if __name__ == "__main__":
+    print(json.dumps(remember(sys.argv[1])))

@@ -62,6 +62,9 @@ def measure_apart(name: str, options: argparse.Namespace) -> dict:
 
 def shown(row: dict) -> list[dict]:
     """Return the lines of a table about a row."""
+    if not row["rates"]:
+        found = {**row["facts"], **row["curves"]}
+        return [{"row": row["name"], "what": name, "found": str(found[name])} for name in found]
     ours = next(iter(row["rates"]))
     return [
         {

@@ -8,8 +8,8 @@ from ifo_grounding.files import write_json
 ROOT = Path(__file__).parents[1]
 
 
-def load_script():
-    spec = importlib.util.spec_from_file_location("make_results", ROOT / "docs" / "make_results.py")
+def load_script(name="make_results"):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -20,6 +20,11 @@ def test_the_tables_are_up_to_date():
     assert script.runs()
     for path, text in script.written().items():
         assert path.read_text() == text, f"{path.name}: run python docs/make_results.py"
+
+
+def test_the_table_of_speeds_is_up_to_date():
+    for path, text in load_script("make_speed").written().items():
+        assert path.read_text() == text, f"{path.name}: run python docs/make_speed.py"
 
 
 def test_every_result_says_where_it_comes_from():

@@ -20,7 +20,7 @@ from ifo_grounding.report.plots import (
     training_curves,
 )
 from ifo_grounding.report.provenance import provenance
-from ifo_grounding.report.rates import compared_rates, reliability_diagram
+from ifo_grounding.report.rates import compared_rates, rates_by_number, reliability_diagram
 from ifo_grounding.report.results import results_rows, results_table
 from ifo_grounding.report.tables import format_cell, markdown_table, text_table
 
@@ -39,6 +39,7 @@ __all__ = [
     "markdown_table",
     "phase_bars",
     "provenance",
+    "rates_by_number",
     "read_metrics",
     "reliability_diagram",
     "results_rows",

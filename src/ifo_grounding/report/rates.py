@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.report.plots import _dress, _figure, _percent
+from ifo_grounding.report.plots import _dress, _figure, _legend, _percent
 from ifo_grounding.report.theme import LIGHT, PALETTE
 from ifo_grounding.stats import Rate
 
@@ -59,6 +59,65 @@ def compared_rates(groups: Mapping[str, Mapping[str, Rate]], *, title: str = "")
     axes.set_yticks(places, labels)
     axes.set_ylim(place - 0.8, -0.8)
     axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+    return figure
+
+
+def rates_by_number(
+    curves: Mapping[str, Mapping[int, Rate]],
+    *,
+    x: str = "demonstrations",
+    references: Mapping[str, float] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw rates against a number that grows by factors, with intervals.
+
+    Args:
+        curves: name of the curve -> {number: rate}.
+        x: what the number counts.
+        references: name -> rate, drawn as a dashed line across.
+        title: above the plot.
+
+    >>> from ifo_grounding.stats import wilson
+    >>> curves = {"phase 1": {500: wilson(60, 100), 2000: wilson(80, 100)}}
+    >>> rates_by_number(curves, references={"paper": 0.766}).axes[0].get_xscale()
+    'log'
+    """
+    if not any(curves.values()):
+        raise UserError("rates_by_number needs at least one curve with one rate")
+    figure, grid = _figure(6.4, 3.8)
+    axes = grid[0, 0]
+    _dress(axes, title, x)
+    axes.set_xscale("log")
+    for place, (name, curve) in enumerate(curves.items()):
+        colour = PALETTE[place % len(PALETTE)]
+        numbers = sorted(curve)
+        rates = [curve[number] for number in numbers]
+        axes.fill_between(
+            numbers,
+            [rate.low for rate in rates],
+            [rate.high for rate in rates],
+            color=colour,
+            alpha=0.18,
+            linewidth=0,
+        )
+        axes.plot(numbers, [r.rate for r in rates], color=colour, marker="o", ms=5, label=name)
+    for name, rate in (references or {}).items():
+        axes.axhline(rate, color=LIGHT["faint"], linestyle="--", linewidth=1.2)
+        axes.annotate(
+            name,
+            (1.0, rate),
+            (-4, 3),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            fontsize=9,
+            color=LIGHT["faint"],
+            ha="right",
+        )
+    numbers = sorted({number for curve in curves.values() for number in curve})
+    axes.set_xticks(numbers, [f"{number:,}" for number in numbers])
+    axes.minorticks_off()
+    _percent(axes)
+    _legend(axes, loc="lower right")
     return figure
 
 

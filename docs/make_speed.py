@@ -1,0 +1,126 @@
+"""Write the table of speeds: ``python docs/make_speed.py`` after ``make bench``.
+
+Reads ``results/bench/*.json`` and writes the part of ``docs/speed.md`` between its two marks, and
+the picture of how costs grow. A test checks that the table is up to date.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from ifo_grounding.files import atomic_write, read_json
+from ifo_grounding.report import markdown_table, save_figure
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "speed.md"
+PICTURE = ROOT / "docs" / "assets" / "growth.png"
+MARKS = ("<!-- speed -->", "<!-- /speed -->")
+
+
+def measured(device: str = "cpu") -> dict[str, dict[str, Any]]:
+    """Return the rows that were measured on a device."""
+    path = ROOT / "results" / "bench" / f"{device}.json"
+    return read_json(path)["rows"] if path.exists() else {}
+
+
+def line(row: dict[str, Any]) -> dict[str, str]:
+    """Return a row of the table of rates."""
+    ours, *others = row["rates"]
+    rate, reach = row["rates"][ours], row["reach"]
+    beside = [
+        f"{name}: {short(row['rates'][name]['median'])}, {times(row['ratios'][name])}"
+        for name in others
+    ]
+    asked = [
+        f"{short(value)}" if name == "rate" else f"{value:g} times {name}"
+        for name, value in reach.items()
+    ]
+    reached = [
+        rate["median"] >= value if name == "rate" else row["ratios"][name]["median"] >= value
+        for name, value in reach.items()
+        if name == "rate" or name in row["ratios"]
+    ]
+    return {
+        "what": row["name"] + (f" ({row['note']})" if row["note"] else ""),
+        "unit": row["unit"],
+        "here": f"**{short(rate['median'])}** [{short(rate['low'])}, {short(rate['high'])}]",
+        "beside, and how many times as fast this is": "<br>".join(beside) or "",
+        "asked": "<br>".join(asked),
+        "reached": ", ".join("yes" if found else "no" for found in reached),
+        "MB": f"{row['peak_mb'][ours]:,.0f}",
+    }
+
+
+def times(ratio: dict[str, float]) -> str:
+    return f"{ratio['median']:.3g}x [{ratio['low']:.3g}, {ratio['high']:.3g}]"
+
+
+def short(value: float) -> str:
+    """Return a number of three digits, with K or M.
+
+    >>> short(1234567.0), short(25_300.0), short(990.0)
+    ('1.23M', '25.3K', '990')
+    """
+    for size, name in ((1e6, "M"), (1e3, "K")):
+        if value >= size:
+            return f"{value / size:.3g}{name}"
+    return f"{value:.3g}"
+
+
+def section() -> str:
+    """Return the tables."""
+    rows = measured()
+    if not rows:
+        return "Not run."
+    made = {
+        f"{row['provenance']['machine']}, {row['provenance']['threads']} threads, torch "
+        f"{row['provenance']['torch']}, commit `{row['provenance']['commit']}`"
+        for row in rows.values()
+    }
+    rates = [line(row) for row in rows.values() if row["rates"]]
+    facts = [
+        {"what": row["name"], "measured": name, "value": f"{value:,.0f}"}
+        for row in rows.values()
+        for name, value in row["facts"].items()
+    ]
+    parts = ["; ".join(sorted(made)) + ".", markdown_table(rates)]
+    parts += [markdown_table(facts)] if facts else []
+    return "\n\n".join(parts)
+
+
+def growth() -> Figure | None:
+    """Draw how long things take by their size, and a line along which cost grows as size does."""
+    curves = measured().get("growth", {}).get("curves")
+    if not curves:
+        return None
+    figure = Figure(figsize=(9.6, 3.2), layout="constrained")
+    for axes, (name, curve) in zip(figure.subplots(1, len(curves)), curves.items(), strict=True):
+        sizes, seconds = [int(n) for n in curve], list(curve.values())
+        linear = [seconds[-1] * size / sizes[-1] for size in sizes]
+        axes.loglog(sizes, linear, color="#9aa0a6", linestyle="--", label="linear")
+        axes.loglog(sizes, seconds, color="#2f5fd0", marker="o", markersize=4, label="measured")
+        axes.set_title(name, fontsize=9, loc="left")
+        axes.set_ylabel("seconds", fontsize=8)
+        axes.tick_params(labelsize=8)
+        axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def written() -> dict[Path, str]:
+    """Return what the page should say."""
+    before, _, rest = PAGE.read_text().partition(MARKS[0])
+    _, _, after = rest.partition(MARKS[1])
+    return {PAGE: f"{before}{MARKS[0]}\n{section()}\n{MARKS[1]}{after}"}
+
+
+def main() -> None:
+    for path, text in written().items():
+        with atomic_write(path) as temporary:
+            temporary.write_text(text)
+    if (figure := growth()) is not None:
+        save_figure(figure, PICTURE)
+
+
+if __name__ == "__main__":
+    main()
