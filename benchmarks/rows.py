@@ -265,7 +265,7 @@ def labelling() -> Row:
     inverse = networks.make_inverse(demos, "strong", seed=0, device=DEVICE)
 
     def work() -> float:
-        label_demonstrations(inverse, demos)
+        label_demonstrations(demos, inverse)
         return demos.transitions
 
     return Row("labelling of demonstrations", "pairs/s", ours(work), {"rate": 60e3})

@@ -187,8 +187,8 @@ class PickAndPlaceEnv(EnvBase):
         if mask is None or mask.all() or keys.PIXELS not in tensordict:
             return super()._reset_proc_data(tensordict, tensordict_reset)
         rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
-        pixels = tensordict.pop(keys.PIXELS).clone()
-        pixels[rows] = tensordict_reset.pop(keys.PIXELS)[rows]
+        drawn = tensordict_reset.pop(keys.PIXELS)
+        pixels = _with_rows(tensordict.pop(keys.PIXELS).clone(), rows, drawn[rows])
         return super()._reset_proc_data(tensordict, tensordict_reset).set(keys.PIXELS, pixels)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -209,9 +209,7 @@ class PickAndPlaceEnv(EnvBase):
         result = TensorDict({}, batch_size=self.batch_size, device=self.device)
         drawn = self.simulator.pixels(rows)
         if rows is not None:
-            pixels = drawn.new_zeros(self.num_envs, *drawn.shape[1:])
-            pixels[rows] = drawn
-            drawn = pixels
+            drawn = _with_rows(drawn.new_zeros(self.num_envs, *drawn.shape[1:]), rows, drawn)
         result[keys.PIXELS] = drawn
         if self.instructed:
             result[keys.INSTRUCTION] = self.simulator.instruction.clone()
@@ -246,3 +244,9 @@ class PickAndPlaceEnv(EnvBase):
     def render(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
         """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
         return self.simulator.pixels(tile_size=tile_size).permute(0, 2, 3, 1).cpu().numpy()
+
+
+def _with_rows(pixels: Tensor, rows: Tensor, drawn: Tensor) -> Tensor:
+    """Write the images ``drawn`` into some rows of ``pixels``, eight pixels at a time."""
+    pixels.view(torch.int64).index_copy_(0, rows, drawn.view(torch.int64))
+    return pixels
