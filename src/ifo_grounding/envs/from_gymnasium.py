@@ -1,0 +1,333 @@
+"""Worlds of Gymnasium that show an image and say an instruction, as a TorchRL environment."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.seeding import STREAMS, derive
+from ifo_grounding.tasks.vocabulary import Vocabulary
+
+ENDED = "ended"
+"""Whether a world has terminated, and whether it was truncated."""
+FLAGS = ("done", "terminated", "truncated")
+CHANNELS = (1, 3, 4)
+
+Make = Callable[[], gymnasium.Env]
+
+
+def from_gymnasium(
+    world: str | Make,
+    *,
+    vocabulary: Vocabulary,
+    num_envs: int = 1,
+    image: str | None = "image",
+    instruction: str = "mission",
+    instructed: bool = True,
+    processes: bool = False,
+    seed: int | None = None,
+    stream: str = "training",
+    device: torch.device | str | None = None,
+    **make_options: Any,
+) -> GymnasiumEnv:
+    """Put a Gymnasium world behind the keys of this library.
+
+    The world has to show an image of bytes and to take actions of a ``Discrete`` space; its
+    instruction is a sentence in the observation or in ``info``. Episodes end as the world says,
+    and its reward is the true one: for evaluation alone, and withheld where ``instructed=False``.
+
+    Args:
+        world: id for :func:`gymnasium.make`, or a function that makes the world (then give it all
+            it needs, wrappers included).
+        vocabulary: the words of the instructions, that of the demonstrations.
+        num_envs: worlds side by side.
+        image: name of the image in the observation; None where the observation is the image.
+        instruction: name of the sentence in the observation, or else in ``info``.
+        instructed: whether episodes show their instruction and pay their reward. Without, only
+            images are read, and an episode that the world ends counts as truncated: what the world
+            was asked for is no business of a learner.
+        processes: whether every world runs in a process of its own.
+        seed: of the stream of scenes; random by default.
+        stream: ``training``, ``validation`` or ``evaluation``: disjoint scenes.
+        device: where tensors go.
+        make_options: for :func:`gymnasium.make`.
+
+    Returns:
+        An environment of batch size [num_envs] with ``pixels``, uint8 [N, C, H, W], and
+        ``instruction``, int64 [N, L]. ``reset`` takes ``"scene"`` as
+        :class:`~ifo_grounding.envs.PickAndPlaceEnv` does: the same number is the same scene, as
+        far as the world obeys its seed.
+
+    Raises:
+        UserError: where image, instruction or actions are not as said; where an instruction has an
+            unknown word.
+
+    >>> from ifo_grounding.tasks import VOCABULARY
+    >>> env = from_gymnasium(
+    ...     "ifo_grounding/Move-v0", vocabulary=VOCABULARY, num_envs=2, image="pixels",
+    ...     instruction="instruction_text", seed=0,
+    ... )
+    >>> env.reset()["pixels"].shape
+    torch.Size([2, 3, 48, 48])
+    """
+    if isinstance(world, str):
+        name = world
+
+        def make() -> gymnasium.Env:
+            return gymnasium.make(name, **make_options)
+    elif make_options:
+        raise UserError(
+            f"options {sorted(make_options)} are for a world made from its id: give them to it in "
+            "your function"
+        )
+    else:
+        make = world
+    return GymnasiumEnv(
+        make,
+        Reading(vocabulary, image, instruction, instructed),
+        num_envs,
+        processes=processes,
+        seed=seed,
+        stream=stream,
+        device=device,
+    )
+
+
+class Reading:
+    """Reads image and instruction out of what a world shows.
+
+    Args:
+        vocabulary: the words of instructions.
+        image: name of the image, None where the observation is the image.
+        instruction: name of the sentence.
+        instructed: whether instructions are read at all.
+    """
+
+    def __init__(
+        self, vocabulary: Vocabulary, image: str | None, instruction: str, instructed: bool
+    ) -> None:
+        self.vocabulary, self.image = vocabulary, image
+        self.instruction, self.instructed = instruction, instructed
+
+    def pixels(self, observation: Any) -> np.ndarray:
+        """Return the image, uint8 [C, H, W]."""
+        seen = observation
+        if self.image is not None:
+            if not isinstance(observation, dict) or self.image not in observation:
+                shown = sorted(observation) if isinstance(observation, dict) else "one array"
+                raise UserError(
+                    f"there is no image {self.image!r} in the observation ({shown}): name it with "
+                    "image=..., or image=None where the observation is the image"
+                )
+            seen = observation[self.image]
+        picture = np.asarray(seen)
+        if picture.dtype != np.uint8 or picture.ndim not in (2, 3):
+            raise UserError(
+                f"images are bytes [H, W, C], [C, H, W] or [H, W], got {picture.dtype} "
+                f"{list(picture.shape)}: wrap the world so that it shows pixels"
+            )
+        if picture.ndim == 2:
+            return picture[None]
+        if picture.shape[-1] in CHANNELS and picture.shape[0] not in CHANNELS:
+            return np.ascontiguousarray(picture.transpose(2, 0, 1))
+        if picture.shape[0] in CHANNELS:
+            return np.ascontiguousarray(picture)
+        raise UserError(f"an image has 1, 3 or 4 channels, got an array of {list(picture.shape)}")
+
+    def sentence(self, observation: Any, info: dict[str, Any]) -> str:
+        """Return the instruction."""
+        for source in (observation, info):
+            if isinstance(source, dict) and self.instruction in source:
+                return str(source[self.instruction])
+        shown = sorted(observation) if isinstance(observation, dict) else "one array"
+        raise UserError(
+            f"there is no instruction {self.instruction!r} in the observation ({shown}) or in info "
+            f"({sorted(info)}): name it with instruction=..."
+        )
+
+
+class Read(gymnasium.Wrapper):
+    """One world as :class:`Reading` reads it: arrays of fixed sizes, which can be batched.
+
+    A vector of worlds refuses to step those that have ended, while tensordicts are stepped as a
+    whole. So ends are told beside the image, and a world that has ended stays as it is.
+    """
+
+    def __init__(self, env: gymnasium.Env, reading: Reading) -> None:
+        super().__init__(env)
+        if not isinstance(env.action_space, gymnasium.spaces.Discrete) or env.action_space.start:
+            raise UserError(
+                f"actions must be Discrete from 0, got {env.action_space}: wrap the world so that "
+                "they are"
+            )
+        self.reading = reading
+        observation, info = env.reset(seed=0)
+        pixels = reading.pixels(observation)
+        spaces: dict[str, gymnasium.Space] = {
+            keys.PIXELS: gymnasium.spaces.Box(0, 255, pixels.shape, np.uint8),
+            ENDED: gymnasium.spaces.MultiBinary(2),
+        }
+        if reading.instructed:
+            words = reading.vocabulary
+            spaces[keys.INSTRUCTION] = gymnasium.spaces.Box(
+                0, len(words) - 1, (words.length,), np.int64
+            )
+            self._tokens = self._encode(observation, info)
+        self.observation_space = gymnasium.spaces.Dict(spaces)
+
+    def reset(self, **options: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode."""
+        observation, info = self.env.reset(**options)
+        if self.reading.instructed:
+            self._tokens = self._encode(observation, info)
+        self._last = self._seen(observation, False, False)
+        return self._last, {}
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Take an action; the instruction is that of the episode's beginning."""
+        if self._last[ENDED].any():
+            return self._last, 0.0, False, False, {}
+        observation, reward, terminated, truncated, _ = self.env.step(int(action))
+        self._last = self._seen(observation, terminated, truncated)
+        return self._last, float(reward), False, False, {}
+
+    def _encode(self, observation: Any, info: dict[str, Any]) -> np.ndarray:
+        sentence = self.reading.sentence(observation, info)
+        return self.reading.vocabulary.encode(sentence)[0].numpy()
+
+    def _seen(self, observation: Any, *ended: bool) -> dict[str, np.ndarray]:
+        pixels = self.reading.pixels(observation)
+        seen = {keys.PIXELS: pixels, ENDED: np.array(ended, dtype=np.int8)}
+        return {**seen, keys.INSTRUCTION: self._tokens} if self.reading.instructed else seen
+
+
+class GymnasiumEnv(EnvBase):
+    """What :func:`from_gymnasium` returns.
+
+    Args:
+        make: makes one world.
+        reading: how to read it.
+        num_envs: worlds side by side.
+        processes: whether each runs in a process of its own.
+        seed: of the stream of scenes.
+        stream: name of the stream.
+        device: where tensors go.
+    """
+
+    def __init__(
+        self,
+        make: Make,
+        reading: Reading,
+        num_envs: int,
+        *,
+        processes: bool = False,
+        seed: int | None = None,
+        stream: str = "training",
+        device: torch.device | str | None = None,
+    ) -> None:
+        check_choice("stream", stream, STREAMS)
+        if num_envs < 1:
+            raise UserError(f"num_envs must be at least 1, got {num_envs}")
+        super().__init__(device=device or "cpu", batch_size=[num_envs])
+        vector = AsyncVectorEnv if processes else SyncVectorEnv
+        makes = [lambda: Read(make(), reading)] * num_envs
+        self.worlds = vector(makes, autoreset_mode=AutoresetMode.DISABLED)
+        self.num_envs, self.instructed, self.stream = num_envs, reading.instructed, stream
+        self.vocabulary = reading.vocabulary
+        self.vocabulary_size = len(reading.vocabulary)
+        self.instruction_length = reading.vocabulary.length
+        self._numbers = torch.full((num_envs,), -1)
+        self._set_seed(seed)
+        self._make_specs()
+
+    @property
+    def scene_numbers(self) -> Tensor:
+        """Number of the scene that each row began with, int64 [num_envs]."""
+        return self._numbers
+
+    def _make_specs(self) -> None:
+        batch, device = tuple(self.batch_size), self.device
+        observation = Composite(shape=batch, device=device)
+        spaces = dict(self.worlds.single_observation_space)  # type: ignore[call-overload]
+        del spaces[ENDED]
+        for name, space in spaces.items():
+            observation[name] = Bounded(
+                0,
+                int(space.high.max()),
+                shape=(*batch, *space.shape),
+                dtype=torch.uint8 if name == keys.PIXELS else torch.int64,
+                device=device,
+            )
+        self.observation_spec = observation
+        actions = int(self.worlds.single_action_space.n)  # type: ignore[attr-defined]
+        self.action_spec = Categorical(actions, shape=batch, device=device)
+        self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
+        flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            {name: flag.clone() for name in FLAGS}, shape=batch, device=device
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        begins = torch.ones(self.num_envs, dtype=torch.bool)
+        if mask is not None and int(self._numbers.min()) >= 0:
+            begins = mask.reshape(self.num_envs).cpu()
+        rows = begins.nonzero().squeeze(-1)
+        if len(rows):
+            asked = None if tensordict is None else tensordict.get(keys.SCENE, None)
+            self._numbers[rows] = self._next(len(rows)) if asked is None else asked.view(-1)[rows]
+            seeds: list[int | None] = [None] * self.num_envs
+            for row in rows.tolist():
+                seeds[row] = derive(self._seed, self.stream, int(self._numbers[row])) % 2**31
+            seen, _ = self.worlds.reset(seed=seeds, options={"reset_mask": begins.numpy()})
+            self._seen = seen
+        return self._observed(
+            **{name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS}
+        ).exclude(keys.REWARD)
+
+    def _next(self, count: int) -> Tensor:
+        first = self._next_number
+        self._next_number += count
+        return torch.arange(first, first + count)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict.get(keys.ACTION).cpu().numpy()
+        self._seen, reward, *_ = self.worlds.step(actions)
+        terminated, truncated = self._seen[ENDED].astype(bool).T
+        done = terminated | truncated
+        if not self.instructed:
+            reward, terminated, truncated = np.zeros_like(reward), np.zeros_like(done), done
+        result = self._observed(done=done, terminated=terminated, truncated=truncated)
+        return result.set(keys.REWARD, self._column(reward.astype(np.float32)))
+
+    def _observed(self, **flags: np.ndarray) -> TensorDict:
+        result = TensorDict({}, batch_size=self.batch_size, device=self.device)
+        for name in self.observation_spec.keys():  # noqa: SIM118
+            result[name] = torch.from_numpy(self._seen[name]).to(self.device)
+        for name, flag in flags.items():
+            result[name] = self._column(flag)
+        return result
+
+    def _column(self, values: np.ndarray) -> Tensor:
+        return torch.from_numpy(values).to(self.device).unsqueeze(-1)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = secrets.randbits(31) if seed is None else seed
+        self._next_number = 0
+
+    def close(self, **options: Any) -> None:
+        """Close the worlds."""
+        self.worlds.close()
+        super().close(**options)

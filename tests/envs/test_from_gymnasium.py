@@ -1,0 +1,200 @@
+"""Worlds that the project did not make, behind its keys."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv, check_env_specs
+
+from envs.dial import MARKS, PRESS, Dial
+from ifo_grounding.envs import from_gymnasium
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import success_rate
+from ifo_grounding.networks import make_policy
+from ifo_grounding.tasks import VOCABULARY, Vocabulary
+from ifo_grounding.transforms import InstructionSampler
+
+WORDS = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS], length=6)
+DIAL = {"vocabulary": WORDS, "image": "view", "instruction": "task"}
+
+
+def dials(num_envs=3, **options):
+    return from_gymnasium(Dial, num_envs=num_envs, **{"seed": 0, **DIAL, **options})
+
+
+@pytest.mark.parametrize("instructed", [True, False])
+def test_specs_hold(instructed):
+    env = dials(instructed=instructed)
+    check_env_specs(env)
+    assert ("instruction" in env.observation_spec) == instructed
+    assert env.observation_spec["pixels"].shape == (3, 3, 20, 28)
+    assert env.action_spec.space.n == 3
+
+
+def test_an_id_is_made_with_its_options():
+    env = from_gymnasium(
+        "ifo_grounding/Move-v0",
+        vocabulary=VOCABULARY,
+        image="pixels",
+        instruction="instruction_text",
+        num_envs=2,
+        tile_size=16,
+    )
+    td = env.reset()
+    assert td["pixels"].shape == (2, 3, 96, 96)
+    assert all(sentence for sentence in VOCABULARY.decode(td["instruction"]))
+
+
+def shown(pixels):
+    """Where each dial [N, 3, 20, 28] stands."""
+    return (pixels[:, 0, 10, 2::4] > 100).int().argmax(-1)
+
+
+def wanted(td):
+    return torch.tensor([MARKS.index(text.split()[-1]) for text in WORDS.decode(td["instruction"])])
+
+
+def test_instructions_and_rewards_are_the_world_s():
+    env = dials(6)
+    td = env.reset()
+    asked = wanted(td)
+    assert (shown(td["pixels"]) != asked).all()
+    earned = torch.zeros(6)
+    for _ in range(6):
+        way = asked - shown(td["pixels"])
+        action = torch.where(way == 0, PRESS, (way > 0).long())
+        td = env.step(td.set("action", action))
+        assert torch.equal(td["next", "terminated"].squeeze(-1), way == 0)
+        earned += td["next", "reward"].squeeze(-1)
+        td = env.step_mdp(td)
+    assert earned.tolist() == [1.0] * 6  # what has ended stays as it is, and pays no more
+
+
+def test_scenes_have_numbers_and_streams_do_not_meet():
+    env, other = dials(4), dials(4)
+    numbers = TensorDict({"scene": torch.tensor([[7], [3], [7], [9]])}, [4])
+    first = env.reset(numbers)
+    assert torch.equal(first["pixels"][0], first["pixels"][2])
+    assert torch.equal(first["instruction"], other.reset(numbers)["instruction"])
+    assert env.scene_numbers.tolist() == [7, 3, 7, 9]
+    many = TensorDict({"scene": torch.arange(30).unsqueeze(-1)}, [30])
+    trained = dials(30).reset(many)["instruction"]
+    evaluated = dials(30, stream="evaluation").reset(many)["instruction"]
+    assert not torch.equal(trained, evaluated)
+
+
+def test_partial_resets_touch_only_their_rows():
+    env = dials(4)
+    td = env.reset()
+    td = env.step_mdp(env.step(td.set("action", torch.tensor([0, 1, 0, 1]))))
+    mask = torch.tensor([[False], [True], [False], [True]])
+    after = env.reset(td.clone().set("_reset", mask))
+    kept = ~mask.squeeze(-1)
+    assert torch.equal(after["pixels"][kept], td["pixels"][kept])
+    assert torch.equal(after["instruction"][kept], td["instruction"][kept])
+    assert env.scene_numbers.tolist() == [0, 4, 2, 5]
+    again = env.step(after.set("action", torch.full((4,), PRESS)))
+    assert torch.equal(again["next", "pixels"], after["pixels"])  # pressing moves nothing
+
+
+def test_rollouts_go_on_after_episodes_end():
+    rollout = dials(3).rollout(40, break_when_any_done=False)
+    assert rollout["next", "terminated"].any()
+    assert ((rollout["next", "reward"] == 1) <= rollout["next", "done"]).all()
+
+
+def test_a_learner_sees_neither_reward_nor_the_world_s_own_goal():
+    env = dials(8, instructed=False, seed=1)
+    rollout = env.rollout(60, break_when_any_done=False)
+    assert not rollout["next", "reward"].any()
+    assert not rollout["next", "terminated"].any()
+    assert rollout["next", "truncated"].any()
+
+
+def test_processes_show_what_one_process_shows():
+    apart, together = dials(2, processes=True), dials(2)
+    for env in (apart, together):
+        torch.manual_seed(0)
+        env.seen = env.rollout(10, break_when_any_done=False)
+    apart.close()
+    for key in ("pixels", "instruction", "action", ("next", "reward")):
+        assert torch.equal(apart.seen[key], together.seen[key])
+
+
+def test_policies_and_evaluation_take_it_as_it_is():
+    env = dials(8)
+    policy = make_policy(env, seed=0)
+    result = success_rate(policy, env, episodes=20)
+    assert result.rate.count == 20
+    assert result.scenes == success_rate(policy, dials(8), episodes=20).scenes
+
+
+def test_instructions_can_be_chosen_for_it():
+    def all_suit(pixels, instruction):
+        return torch.full((len(pixels), 1), 9.0)
+
+    classifier = TensorDictModule(all_suit, ["pixels", "instruction"], ["suitability"])
+    pool = WORDS.encode([f"turn the dial to {mark}" for mark in MARKS])
+    env = TransformedEnv(dials(3, instructed=False), InstructionSampler(classifier, pool))
+    check_env_specs(env)
+    assert all(text.startswith("turn") for text in WORDS.decode(env.reset()["instruction"]))
+
+
+class Odd(Dial):
+    def __init__(self, view, action_space=None):
+        super().__init__()
+        self.view = view
+        if action_space is not None:
+            self.action_space = action_space
+
+    def _observe(self):
+        return {"view": self.view, "task": "turn the dial to one"}
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "said"),
+    [
+        (Dial, {"image": "picture"}, "no image 'picture'.*task.*view"),
+        (Dial, {"image": None}, "bytes"),
+        (Dial, {"instruction": "mission"}, "no instruction 'mission'.*wanted"),
+        (Dial, {"vocabulary": Vocabulary(["turn", "the"])}, "unknown word 'dial'"),
+        (Dial, {"num_envs": 0}, "num_envs"),
+        (Dial, {"stream": "test"}, "stream"),
+        (Dial, {"max_steps": 3}, "in your function"),
+        (lambda: Odd(np.zeros((20, 28, 3))), {}, "bytes .* float64"),
+        (lambda: Odd(np.zeros((20, 28, 5), np.uint8)), {}, "channels"),
+        (
+            lambda: Odd(np.zeros((20, 28), np.uint8), gymnasium.spaces.Box(0, 1, (2,))),
+            {},
+            "Discrete",
+        ),
+    ],
+)
+def test_worlds_that_do_not_fit_are_refused(make, options, said):
+    with pytest.raises(UserError, match=said):
+        from_gymnasium(make, **{"seed": 0, **DIAL, **options})
+
+
+@pytest.mark.parametrize("shape", [(20, 28), (1, 20, 28), (20, 28, 1), (3, 20, 28)])
+def test_images_come_in_every_usual_order(shape):
+    env = from_gymnasium(lambda: Odd(np.zeros(shape, np.uint8)), seed=0, **DIAL)
+    channels = 3 if 3 in shape else 1
+    assert env.reset()["pixels"].shape == (1, channels, 20, 28)
+
+
+def test_babyai_shows_its_room_and_says_its_mission():
+    pytest.importorskip("minigrid")
+    from minigrid.wrappers import RGBImgObsWrapper
+
+    def make():
+        return RGBImgObsWrapper(gymnasium.make("BabyAI-GoToObj-v0"), tile_size=8)
+
+    missions = [make().reset(seed=seed)[0]["mission"] for seed in range(60)]
+    words = Vocabulary.from_sentences(missions, length=8)
+    env = from_gymnasium(make, vocabulary=words, num_envs=2, seed=0)
+    check_env_specs(env)
+    td = env.reset()
+    assert td["pixels"].shape == (2, 3, 64, 64)
+    assert all(text.startswith("go to the") for text in words.decode(td["instruction"]))
