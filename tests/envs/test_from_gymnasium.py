@@ -113,6 +113,20 @@ def test_a_learner_sees_neither_reward_nor_the_world_s_own_goal():
     assert rollout["next", "truncated"].any()
 
 
+@pytest.mark.parametrize(("stop", "actions", "action"), [("add", 4, 3), (PRESS, 3, PRESS)])
+@pytest.mark.parametrize("instructed", [True, False])
+def test_a_policy_can_say_that_it_is_done(stop, actions, action, instructed):
+    env = dials(2, stop=stop, instructed=instructed)
+    check_env_specs(env)
+    assert env.action_spec.space.n == actions
+    td = env.reset()
+    after = env.step(td.set("action", torch.tensor([0, action])))["next"]
+    assert after["terminated"].flatten().tolist() == [False, True]
+    assert not after["truncated"].any()
+    assert torch.equal(after["pixels"][1], td["pixels"][1])
+    assert not after["reward"].any()
+
+
 def test_processes_show_what_one_process_shows():
     apart, together = dials(2, processes=True), dials(2)
     for env in (apart, together):
@@ -161,6 +175,8 @@ class Odd(Dial):
         (Dial, {"instruction": "mission"}, "no instruction 'mission'.*wanted"),
         (Dial, {"vocabulary": Vocabulary(["turn", "the"])}, "unknown word 'dial'"),
         (Dial, {"num_envs": 0}, "num_envs"),
+        (Dial, {"stop": 7}, "stop must be an action 0..2"),
+        (Dial, {"stop": "press"}, "stop"),
         (Dial, {"stream": "test"}, "stream"),
         (Dial, {"max_steps": 3}, "in your function"),
         (lambda: Odd(np.zeros((20, 28, 3))), {}, "bytes .* float64"),

@@ -1,5 +1,6 @@
 """Data: frames stored compactly, demonstrations without actions, transitions and labels."""
 
+from ifo_grounding.data.babyai import babyai, record_babyai
 from ifo_grounding.data.buffers import first_frame_buffer, goal_buffer
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
@@ -30,10 +31,12 @@ __all__ = [
     "RandomActions",
     "TransitionReport",
     "Truth",
+    "babyai",
     "collect_transitions",
     "first_frame_buffer",
     "goal_buffer",
     "label_demonstrations",
     "labelled_buffer",
+    "record_babyai",
     "record_demonstrations",
 ]

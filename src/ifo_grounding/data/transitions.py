@@ -27,9 +27,6 @@ KIND = "ifo-grounding transitions"
 VERSION = 1
 BATCH_FRAMES = 2048
 READ_KEYS = (keys.PIXELS, keys.ACTION, (keys.NEXT, keys.PIXELS))
-KIND = "ifo-grounding transitions"
-VERSION = 1
-ARRAYS = ("pixels", "next_pixels", "actions", "taken", "kept")
 
 
 class RandomActions(TensorDictModuleBase):

@@ -21,7 +21,8 @@ from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 ENDED = "ended"
-"""Whether a world has terminated, and whether it was truncated."""
+"""Whether a world has terminated, whether it was truncated, and whether the policy stopped."""
+ADD = "add"
 FLAGS = ("done", "terminated", "truncated")
 CHANNELS = (1, 3, 4)
 
@@ -36,6 +37,7 @@ def from_gymnasium(
     image: str | None = "image",
     instruction: str = "mission",
     instructed: bool = True,
+    stop: int | str | None = None,
     processes: bool = False,
     seed: int | None = None,
     stream: str = "training",
@@ -58,6 +60,11 @@ def from_gymnasium(
         instructed: whether episodes show their instruction and pay their reward. Without, only
             images are read, and an episode that the world ends counts as truncated: what the world
             was asked for is no business of a learner.
+        stop: how a policy says that it is done, in a world where episodes do not end by an action.
+            The number of an action that does nothing there, such as MiniGrid's ``done`` (6), or
+            ``"add"`` for one more action that never reaches the world. It terminates the episode;
+            close the demonstrations with
+            :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match.
         processes: whether every world runs in a process of its own.
         seed: of the stream of scenes; random by default.
         stream: ``training``, ``validation`` or ``evaluation``: disjoint scenes.
@@ -96,7 +103,7 @@ def from_gymnasium(
         make = world
     return GymnasiumEnv(
         make,
-        Reading(vocabulary, image, instruction, instructed),
+        Reading(vocabulary, image, instruction, instructed, stop),
         num_envs,
         processes=processes,
         seed=seed,
@@ -113,13 +120,21 @@ class Reading:
         image: name of the image, None where the observation is the image.
         instruction: name of the sentence.
         instructed: whether instructions are read at all.
+        stop: the action that ends an episode, ``"add"`` for one more, None where the world has one.
     """
 
     def __init__(
-        self, vocabulary: Vocabulary, image: str | None, instruction: str, instructed: bool
+        self,
+        vocabulary: Vocabulary,
+        image: str | None,
+        instruction: str,
+        instructed: bool,
+        stop: int | str | None = None,
     ) -> None:
+        if isinstance(stop, str):
+            check_choice("stop", stop, (ADD,))
         self.vocabulary, self.image = vocabulary, image
-        self.instruction, self.instructed = instruction, instructed
+        self.instruction, self.instructed, self.stop = instruction, instructed, stop
 
     def pixels(self, observation: Any) -> np.ndarray:
         """Return the image, uint8 [C, H, W]."""
@@ -173,11 +188,18 @@ class Read(gymnasium.Wrapper):
                 "they are"
             )
         self.reading = reading
+        count = int(env.action_space.n)
+        added = reading.stop == ADD
+        self.stop = count if added else reading.stop
+        if self.stop is not None and not 0 <= int(self.stop) <= count:
+            raise UserError(f"stop must be an action 0..{count - 1} or {ADD!r}, got {self.stop}")
+        self.action_space = gymnasium.spaces.Discrete(count + added)
+        self._reaches = range(count)
         observation, info = env.reset(seed=0)
         pixels = reading.pixels(observation)
         spaces: dict[str, gymnasium.Space] = {
             keys.PIXELS: gymnasium.spaces.Box(0, 255, pixels.shape, np.uint8),
-            ENDED: gymnasium.spaces.MultiBinary(2),
+            ENDED: gymnasium.spaces.MultiBinary(3),
         }
         if reading.instructed:
             words = reading.vocabulary
@@ -192,15 +214,19 @@ class Read(gymnasium.Wrapper):
         observation, info = self.env.reset(**options)
         if self.reading.instructed:
             self._tokens = self._encode(observation, info)
-        self._last = self._seen(observation, False, False)
+        self._last = self._seen(observation, False, False, False)
         return self._last, {}
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Take an action; the instruction is that of the episode's beginning."""
         if self._last[ENDED].any():
             return self._last, 0.0, False, False, {}
+        stopped = int(action) == self.stop
+        if int(action) not in self._reaches:
+            self._last = {**self._last, ENDED: np.array([0, 0, 1], dtype=np.int8)}
+            return self._last, 0.0, False, False, {}
         observation, reward, terminated, truncated, _ = self.env.step(int(action))
-        self._last = self._seen(observation, terminated, truncated)
+        self._last = self._seen(observation, terminated, truncated, stopped)
         return self._last, float(reward), False, False, {}
 
     def _encode(self, observation: Any, info: dict[str, Any]) -> np.ndarray:
@@ -305,10 +331,11 @@ class GymnasiumEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get(keys.ACTION).cpu().numpy()
         self._seen, reward, *_ = self.worlds.step(actions)
-        terminated, truncated = self._seen[ENDED].astype(bool).T
-        done = terminated | truncated
+        terminated, truncated, stopped = self._seen[ENDED].astype(bool).T
+        done = terminated | truncated | stopped
+        terminated = terminated | stopped
         if not self.instructed:
-            reward, terminated, truncated = np.zeros_like(reward), np.zeros_like(done), done
+            reward, terminated, truncated = np.zeros_like(reward), stopped, done & ~stopped
         result = self._observed(done=done, terminated=terminated, truncated=truncated)
         return result.set(keys.REWARD, self._column(reward.astype(np.float32)))
 
