@@ -15,18 +15,30 @@ from ifo_grounding.report import markdown_table, save_figure
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "speed.md"
 PICTURE = ROOT / "docs" / "assets" / "growth.png"
+OURS = "ifo-grounding"
+ORDER = (
+    *("step", "pixels", "rollout", "gymnasium", "collector-strong", "collector-paper", "sampler"),
+    *("imitation-strong", "imitation-paper", "labelling", "transitions", "recording", "memory"),
+    "growth",
+)
+"""Of the rows in the table; others come last."""
 MARKS = ("<!-- speed -->", "<!-- /speed -->")
 
 
 def measured(device: str = "cpu") -> dict[str, dict[str, Any]]:
     """Return the rows that were measured on a device."""
     path = ROOT / "results" / "bench" / f"{device}.json"
-    return read_json(path)["rows"] if path.exists() else {}
+    found = read_json(path)["rows"] if path.exists() else {}
+    return {name: found[name] for name in sorted(found, key=place)}
+
+
+def place(name: str) -> int:
+    return ORDER.index(name) if name in ORDER else len(ORDER)
 
 
 def line(row: dict[str, Any]) -> dict[str, str]:
     """Return a row of the table of rates."""
-    ours, *others = row["rates"]
+    ours, others = OURS, [name for name in row["rates"] if name != OURS]
     rate, reach = row["rates"][ours], row["reach"]
     beside = [
         f"{name}: {short(row['rates'][name]['median'])}, {times(row['ratios'][name])}"

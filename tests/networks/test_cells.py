@@ -10,6 +10,7 @@ from ifo_grounding.networks import (
     Shapes,
     make_goal_judge,
     make_instruction_classifier,
+    make_inverse,
     make_policy,
     make_value,
 )
@@ -18,7 +19,7 @@ from ifo_grounding.networks.cells import Cells, pair_up
 
 
 def plainly(monkeypatch) -> None:
-    monkeypatch.setattr(PatchEncoder, "cells", lambda self, image: None)
+    monkeypatch.setattr(PatchEncoder, "cells", lambda self, image, complete=None: None)
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,23 @@ def test_outputs_and_gradients_are_those_of_a_plain_pass(make, scenes, monkeypat
 def network_looks_up_cells(network, pixels) -> bool:
     encoder = next(part for part in network.modules() if isinstance(part, PatchEncoder))
     return isinstance(encoder.cells(pixels), Cells)
+
+
+def test_the_inverse_module_looks_up_what_changed(scenes, monkeypatch):
+    pixels, _, shapes = scenes
+    after = pixels.clone()
+    after[::2] = pixels[1::2]  # every other pair of frames differs, the rest show a stop
+    network = make_inverse(shapes, seed=0).module
+    looked_up = []
+    maps = Cells.maps
+    monkeypatch.setattr(Cells, "maps", lambda *args: looked_up.append(1) or maps(*args))
+    quick, gradients = outputs_and_gradients(network, pixels, after)
+    assert looked_up
+    plainly(monkeypatch)
+    plain, expected = outputs_and_gradients(network, pixels, after)
+    torch.testing.assert_close(quick, plain)
+    for name, gradient in gradients.items():
+        torch.testing.assert_close(gradient, expected[name], atol=1e-5, rtol=1e-4)
 
 
 def test_two_images_at_once(scenes, monkeypatch):

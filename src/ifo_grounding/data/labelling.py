@@ -100,7 +100,7 @@ def label_demonstrations(
     demos: Demonstrations,
     inverse: TensorDictModuleBase,
     *,
-    batch_size: int = 4096,
+    batch_size: int = 1024,
     device: torch.device | str | None = None,
     progress: bool = True,
     logits_key: NestedKey = keys.LOGITS,

@@ -32,6 +32,10 @@ class Cells:
         """Return the number of feature maps."""
         return len(self.index)
 
+    def maps(self, height: int, width: int) -> Tensor:
+        """Return the feature maps, [N, F, height, width], channels last in memory."""
+        return look_up(self.features, self.index).unflatten(1, (height, width)).movedim(-1, 1)
+
     def __getitem__(self, rows: Tensor | slice) -> Cells:
         """Return the feature maps of some rows."""
         return Cells(self.features, self.index[rows])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -75,10 +76,16 @@ class PatchEncoder(nn.Module):
         patches = self._patches(self._padded(image), self.patch)
         return self.embed(as_float(patches)).permute(0, 3, 1, 2)
 
-    def cells(self, image: Tensor) -> Cells | None:
+    def cells(
+        self, image: Tensor, complete: Callable[[Tensor], Tensor] | None = None
+    ) -> Cells | None:
         """Map an image [N, C, H, W] to its distinct cells; None where that would not pay.
 
         It pays on a CPU, for images of bytes in which more than half of the patches repeat.
+
+        Args:
+            image: [N, C, H, W].
+            complete: makes what is embedded out of distinct patches, uint8 [U, C, patch * patch].
         """
         plain = image.dtype == torch.uint8 and image.device.type == "cpu"
         if not plain or self.patch % WORD or hidden_from_python(image):
@@ -88,7 +95,10 @@ class PatchEncoder(nn.Module):
         rows, index = distinct_rows(patches.flatten(0, 2))
         if 2 * len(rows) > len(index):
             return None
-        features = self.embed(as_float(rows.view(torch.uint8)))
+        distinct = rows.view(torch.uint8)
+        if complete is not None:
+            distinct = complete(distinct.unflatten(1, (-1, self.patch**2))).flatten(1)
+        features = self.embed(as_float(distinct))
         return Cells(features, index.view(patches.shape[:3]).flatten(1))
 
     def _patches(self, image: Tensor, width: int) -> Tensor:

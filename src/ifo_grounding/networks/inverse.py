@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ifo_grounding import keys
 from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
 from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.encoders import PatchEncoder
 from ifo_grounding.networks.fusion import ResidualBlock, pool_cells
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.trunk import (
@@ -49,14 +50,27 @@ class InverseNetwork(Network):
         before, batch = self.flat_pixels(pixels)
         after, next_batch = self.flat_pixels(next_pixels)
         same_batch(pixels=batch, next_pixels=next_batch)
-        images = [before, after]
-        if self.strong:
-            images.append(torch.maximum(before, after) - torch.minimum(before, after))
         with self.autocast(pixels):
-            features = F.relu(self.image(torch.cat(images, -3)))
+            features = F.relu(self._encoded(torch.cat([before, after], -3)))
             features = F.relu(self.blocks(features))
             outputs = self.head(pool_cells(features) if self.strong else flatten_cells(features))
         return outputs.float().reshape(*batch, outputs.shape[-1])
+
+    def _encoded(self, both: Tensor) -> Tensor:
+        """Encode two images on top of each other, [N, 2 C, H, W], to [N, F, h, w]."""
+        if not self.strong:
+            return self.image(both)
+        assert isinstance(self.image, PatchEncoder)
+        cells = self.image.cells(both, _with_change)
+        if cells is None:
+            return self.image(_with_change(both))
+        return cells.maps(*grid(self.shapes, self.config))
+
+
+def _with_change(both: Tensor) -> Tensor:
+    """Lay on top of two images [N, 2 C, ...] how far each pixel changed: [N, 3 C, ...]."""
+    before, after = both.chunk(2, 1)
+    return torch.cat([both, torch.maximum(before, after) - torch.minimum(before, after)], 1)
 
 
 def make_inverse(
