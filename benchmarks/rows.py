@@ -210,10 +210,10 @@ def sampler() -> Row:
 
     @torch.no_grad()
     def score() -> float:
-        for rows in torch.arange(batch, device=DEVICE).split(128):
-            index = torch.randint(sentences, (len(rows), candidates), device=DEVICE)
-            words = classifier.encode_instruction(pool)
-            classifier.score_candidates(classifier.encode_scenes(pixels[rows]), words, index)
+        words = classifier.encode_instruction(pool)
+        index = torch.randint(sentences, (batch, candidates), device=DEVICE)
+        for rows in torch.arange(batch, device=DEVICE).split(32):
+            classifier.score_candidates(classifier.encode_scenes(pixels[rows]), words, index[rows])
         return batch * candidates
 
     def reset() -> float:

@@ -108,13 +108,14 @@ def growth() -> Figure | None:
         return None
     figure = Figure(figsize=(9.6, 3.2), layout="constrained")
     for axes, (name, curve) in zip(figure.subplots(1, len(curves)), curves.items(), strict=True):
-        sizes, seconds = [int(n) for n in curve], list(curve.values())
+        sizes = sorted(map(int, curve))
+        seconds = [curve[str(size)] for size in sizes]
         linear = [seconds[-1] * size / sizes[-1] for size in sizes]
         axes.loglog(sizes, linear, color="#9aa0a6", linestyle="--", label="linear")
         axes.loglog(sizes, seconds, color="#2f5fd0", marker="o", markersize=4, label="measured")
         axes.set_title(name, fontsize=9, loc="left")
         axes.set_ylabel("seconds", fontsize=8)
-        axes.tick_params(labelsize=8)
+        axes.tick_params(labelsize=8, which="both")
         axes.legend(frameon=False, fontsize=8)
     return figure
 
