@@ -207,45 +207,18 @@ def brief(value: Rate | Difference) -> str:
     return str(value).rpartition(" (")[0].replace(" points", "")
 
 
-def overview(found: list[dict[str, Any]]) -> str:
-    """Return a table with one row per run."""
-    rows = []
-    for run in found:
-        results, options = run["results"], run["options"]
-        rows.append(
-            {
-                "task": options["task"],
-                "demonstrations": options["demonstrations"]["n"],
-                "phase 1": brief(restored(Rate, results["phase1"]["rate"])),
-                "phase 2": brief(restored(Rate, results["phase2"]["rate"])),
-                "gain, points": brief(restored(Difference, results["gain"])),
-                "suitable rate": brief(restored(Rate, results["suitability"]["rate"])),
-            }
-        )
-    return markdown_table(rows)
-
-
 def page(found: list[dict[str, Any]]) -> str:
     """Return the page of results."""
     parts = [
         "# Results",
         "Every number here comes from a file under `results/`, which holds all options, the seed,"
         " the commit and the machine. `python docs/make_results.py` writes this page from them.",
-        "## Both phases on few demonstrations",
-        "Preset `strong`, budget `demo`, one seed; success of the greedy policy on 2,000 evaluation"
-        " scenes, with Wilson's 95% interval; the gain is paired by scene. One seed is a lead, not"
-        " a result over seeds.",
-        overview(found),
-        "A gain of exactly 0 means that no policy of phase 2 had a clearly higher learned return,"
-        " so that phase 1's was kept. The runs of commit `f4fc2f9` and before are of an earlier"
-        " preset `strong`, which flattened its feature map; see the changelog. They have not been"
-        " repeated with the present one.",
     ]
     parts += [*study_section(), *variant_section(), *module_section()]
     for run in found:
         made = run["provenance"]
         parts += [
-            f"## {run['options']['task']}",
+            f"## A run of the demo: {run['options']['task']}",
             f"`{run['command']}`, seed {run['options']['seed']}, commit `{made['commit']}`, "
             f"{made['machine']} ({made['cores']} cores, torch threads: {made['threads']}), torch "
             f"{made['torch']}, {run['seconds'] / 60:.1f} minutes, scenes "
@@ -255,18 +228,22 @@ def page(found: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def readme(found: list[dict[str, Any]], text: str) -> str:
+def readme(text: str) -> str:
     """Return the README with its table of results renewed."""
     before, _, rest = text.partition(MARKS[0])
     _, _, after = rest.partition(MARKS[1])
-    return f"{before}{MARKS[0]}\n{overview(found)}\n{MARKS[1]}{after}"
+    shown = ("task", "demonstrations", "seeds", "phase 1", "phase 2")
+    against = ("over continued", "over cloned")
+    rows = [study_row(key, runs) for key, runs in practised().items() if ", " not in key[2]]
+    table = markdown_table([{name: row[name] for name in (*shown, *against)} for row in rows])
+    return f"{before}{MARKS[0]}\n{table}\n{MARKS[1]}{after}"
 
 
 def written() -> dict[Path, str]:
     """Return what each file should say."""
     found = runs()
     path = ROOT / "README.md"
-    return {ROOT / "docs" / "results.md": page(found), path: readme(found, path.read_text())}
+    return {ROOT / "docs" / "results.md": page(found), path: readme(path.read_text())}
 
 
 def main() -> None:
