@@ -11,6 +11,7 @@ from ifo_grounding.data.labelling import (
     label_demonstrations,
     labelled_buffer,
 )
+from ifo_grounding.data.pictures import load_pictures, save_pictures
 from ifo_grounding.data.recording import record_demonstrations
 from ifo_grounding.data.transitions import (
     Collected,
@@ -37,6 +38,8 @@ __all__ = [
     "goal_buffer",
     "label_demonstrations",
     "labelled_buffer",
+    "load_pictures",
     "record_babyai",
     "record_demonstrations",
+    "save_pictures",
 ]

@@ -12,6 +12,8 @@ from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.errors import UserError
 
 PIECE_FRAMES = 512
+LEAST_SIDE = 8
+"""Arrays whose last axis alone is shorter than this are taken for images with colours last."""
 
 
 def check_parts(
@@ -72,6 +74,11 @@ def pieces(episodes: Iterable[Tensor | np.ndarray], lengths: list[int]) -> Itera
             raise UserError(
                 f"episode {len(lengths)} is {frames.dtype} {list(frames.shape)}: give uint8 "
                 "[T + 1, C, H, W] with at least one frame"
+            )
+        if frames.shape[-1] in (3, 4) and min(frames.shape[1:3]) >= LEAST_SIDE:
+            raise UserError(
+                f"episode {len(lengths)} has images {list(frames.shape[1:])}, with the colours "
+                "last: give [T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"
             )
         if waiting and frames.shape[1:] != waiting[0].shape[1:]:
             raise UserError(

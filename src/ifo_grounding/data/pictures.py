@@ -1,0 +1,219 @@
+"""Demonstrations from and to pictures: a list of instructions, and frames of each episode."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageSequence, UnidentifiedImageError
+from tqdm import tqdm
+
+from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.files import atomic_write
+from ifo_grounding.tasks.vocabulary import Vocabulary
+
+LIST = "episodes.jsonl"
+FORMATS = ("png", "gif")
+FILES = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
+MILLISECONDS = 250
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A line of the list."""
+
+    name: str
+    instruction: str
+    path: Path
+    """Folder of pictures, in the order of their names, or one animated picture."""
+
+
+def load_pictures(
+    folder: str | Path,
+    *,
+    vocabulary: Vocabulary | None = None,
+    tile_size: int | None = None,
+    close: bool = True,
+    progress: bool = False,
+) -> Demonstrations:
+    """Read demonstrations that were recorded as pictures.
+
+    The folder holds ``episodes.jsonl`` with one line per episode, such as
+    ``{"episode": "0001", "instruction": "go to the red ball"}``, and for each of them a folder of
+    that name with its frames, in the order of their names, or an animated picture of that name
+    (``0001.gif``). A line may name another path as ``"frames"``.
+
+    Frames are read one episode after the other and stored compactly: the pixels of all episodes
+    are never in memory together, unless no tile repeats.
+
+    Args:
+        folder: where from.
+        vocabulary: the words of the instructions; by default those that occur.
+        tile_size: of the codec; the cheapest one by default.
+        close: whether to repeat the last frame of episodes that do not show their stop.
+        progress: whether to show a bar.
+
+    Raises:
+        UserError: naming the episode, where a line, a frame or an instruction is not as it has to
+            be.
+    """
+    folder = Path(folder)
+    episodes = read_list(folder)
+    sentences = [episode.instruction for episode in episodes]
+    words = vocabulary or Vocabulary.from_sentences(
+        sentences, max(len(s.split()) for s in sentences)
+    )
+    for episode in episodes:
+        try:
+            words.encode(episode.instruction)
+        except UserError as error:
+            raise UserError(f"episode {episode.name!r}: {error}") from None
+    demos = Demonstrations.from_arrays(
+        _frames(episodes, progress), sentences, vocabulary=words, tile_size=tile_size
+    )
+    return demos.close_episodes() if close else demos
+
+
+def read_list(folder: Path) -> list[Episode]:
+    """Read the list of a folder's episodes.
+
+    Raises:
+        UserError: where it is missing or empty, or a line of it is not as it has to be.
+    """
+    path = folder / LIST
+    if not path.exists():
+        raise UserError(
+            f"{path} does not exist: write one line per episode, such as "
+            '{"episode": "0001", "instruction": "go to the red ball"}'
+        )
+    episodes: list[Episode] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            entry = json.loads(line)
+            name, instruction = str(entry["episode"]), str(entry["instruction"]).strip()
+        except (json.JSONDecodeError, KeyError, TypeError):
+            raise UserError(
+                f"{path}, line {number}: a line is a JSON object with 'episode' and 'instruction'"
+            ) from None
+        if not instruction:
+            raise UserError(f"episode {name!r} has no instruction ({path}, line {number})")
+        episodes.append(Episode(name, instruction, _where(folder, name, entry.get("frames"))))
+    if not episodes:
+        raise UserError(f"{path} lists no episode")
+    name, times = Counter(episode.name for episode in episodes).most_common(1)[0]
+    if times > 1:
+        raise UserError(f"{path} lists episode {name!r} {times} times")
+    return episodes
+
+
+def _where(folder: Path, name: str, given: object) -> Path:
+    if given is not None:
+        path = folder / str(given)
+    else:
+        path = next(
+            (p for p in (folder / name, folder / f"{name}.gif") if p.exists()), folder / name
+        )
+    if not path.exists():
+        raise UserError(f"episode {name!r} has no frames: {path} does not exist")
+    return path
+
+
+def _frames(episodes: list[Episode], progress: bool) -> Iterator[np.ndarray]:
+    """Yield the frames of each episode, uint8 [T + 1, 3, H, W]."""
+    first: tuple[str, tuple[int, int]] | None = None
+    for episode in tqdm(episodes, desc="read", disable=not progress):
+        frames = []
+        for place, picture in _pictures(episode):
+            first = first or (episode.name, picture.size)
+            if picture.size != first[1]:
+                raise UserError(
+                    f"episode {episode.name!r}: {place} has {_size(picture.size)} pixels, those of "
+                    f"episode {first[0]!r} have {_size(first[1])}: scale them to one size"
+                )
+            frames.append(np.asarray(picture))
+        if len(frames) < 2:
+            raise UserError(
+                f"episode {episode.name!r} has {len(frames)} frame: a demonstration shows at least "
+                "one step, which takes two"
+            )
+        yield np.stack(frames).transpose(0, 3, 1, 2)
+
+
+def _pictures(episode: Episode) -> Iterator[tuple[str, Image.Image]]:
+    """Yield name and RGB picture of each frame."""
+    if episode.path.is_dir():
+        paths = sorted(p for p in episode.path.iterdir() if p.suffix.lower() in FILES)
+        if not paths:
+            raise UserError(
+                f"episode {episode.name!r} has no frames: {episode.path} holds none of "
+                + ", ".join(sorted(FILES))
+            )
+    else:
+        paths = [episode.path]
+    for path in paths:
+        try:
+            with Image.open(path) as opened:
+                for number, frame in enumerate(ImageSequence.Iterator(opened)):
+                    name = path.name if episode.path.is_dir() else f"{path.name}, frame {number}"
+                    yield name, frame.convert("RGB")
+        except (UnidentifiedImageError, OSError, SyntaxError) as error:
+            raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def save_pictures(
+    demos: Demonstrations, folder: str | Path, *, kind: str = "png", scale: int = 1
+) -> None:
+    """Write demonstrations as pictures, to look at or for other tools.
+
+    Args:
+        demos: with a vocabulary.
+        folder: where to; it appears when everything is written, and :func:`load_pictures` reads it.
+        kind: ``png``, a folder of frames per episode, or ``gif``, an animation of each. A GIF holds
+            256 colours a frame: pictures with more come back changed.
+        scale: by which every pixel is enlarged.
+
+    Raises:
+        UserError: where there is no vocabulary, or an unknown kind.
+    """
+    check_choice("kind", kind, FORMATS)
+    if scale < 1:
+        raise UserError(f"scale must be at least 1, got {scale}")
+    sentences = demos.sentences()
+    digits = len(str(len(demos) - 1))
+    with atomic_write(folder) as temporary:
+        temporary.mkdir()
+        lines = []
+        for number, sentence in enumerate(sentences):
+            name = f"{number:0{digits}d}"
+            lines.append(json.dumps({"episode": name, "instruction": sentence}))
+            frames = demos[number]["pixels"].permute(0, 2, 3, 1).numpy()
+            pictures = [_enlarged(Image.fromarray(frame), scale) for frame in frames]
+            if kind == "gif":
+                pictures[0].save(
+                    temporary / f"{name}.gif",
+                    save_all=True,
+                    append_images=pictures[1:],
+                    duration=MILLISECONDS,
+                    loop=0,
+                )
+                continue
+            (temporary / name).mkdir()
+            for step, picture in enumerate(pictures):
+                picture.save(temporary / name / f"{step:04d}.png")
+        (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _enlarged(picture: Image.Image, scale: int) -> Image.Image:
+    size = (picture.width * scale, picture.height * scale)
+    return picture if scale == 1 else picture.resize(size, Image.Resampling.NEAREST)

@@ -1,0 +1,133 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ifo_grounding.data import Demonstrations, load_pictures, record_demonstrations, save_pictures
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks import VOCABULARY, Vocabulary
+
+
+@pytest.fixture
+def demos():
+    return record_demonstrations("move", 12, seed=0)
+
+
+def all_frames(demos):
+    return demos.frames(torch.arange(demos.n_frames))
+
+
+def test_pictures_come_back_as_they_were(demos, tmp_path):
+    save_pictures(demos, tmp_path / "shown")
+    back = load_pictures(tmp_path / "shown", vocabulary=VOCABULARY)
+    assert back.sentences() == demos.sentences()
+    assert torch.equal(back.lengths, demos.lengths)
+    assert torch.equal(all_frames(back), all_frames(demos))
+    assert torch.equal(back.tokens, demos.tokens)
+
+
+def test_animations_hold_every_frame(tmp_path):
+    frames = [torch.randint(0, 2, (5, 3, 16, 24), dtype=torch.uint8) * 255 for _ in range(3)]
+    demos = Demonstrations.from_arrays(frames, ["go on", "go back", "stay"])
+    save_pictures(demos, tmp_path / "shown", kind="gif", scale=2)
+    back = load_pictures(tmp_path / "shown", close=False)
+    large = all_frames(demos).repeat_interleave(2, -1).repeat_interleave(2, -2)
+    assert torch.equal(all_frames(back), large)
+    assert back.sentences() == demos.sentences()
+
+
+def test_episodes_that_do_not_show_their_stop_are_closed(tmp_path):
+    write(tmp_path, [("a", "go", [0, 1, 2])])
+    assert load_pictures(tmp_path).lengths.tolist() == [4]
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [3]
+
+
+def test_any_path_and_colour_mode_will_do(tmp_path):
+    picture(tmp_path / "one" / "0.png", 7, mode="L")
+    picture(tmp_path / "one" / "1.png", 8, mode="RGBA")
+    lines = [{"episode": "first", "instruction": "Go on", "frames": "one"}]
+    (tmp_path / "episodes.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n\n")
+    demos = load_pictures(tmp_path, close=False)
+    assert demos.image_shape == (3, 16, 24)
+    assert all_frames(demos).amax((1, 2, 3)).tolist() == [7, 8]
+    assert demos.sentences() == ["go on"]
+
+
+def picture(path, value, size=(24, 16), mode="RGB"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((size[1], size[0], 3), value, np.uint8)).convert(mode).save(path)
+
+
+def write(folder, episodes):
+    lines = []
+    for name, instruction, values in episodes:
+        for step, value in enumerate(values):
+            picture(folder / name / f"{step}.png", value)
+        lines.append(json.dumps({"episode": name, "instruction": instruction}))
+    (folder / "episodes.jsonl").write_text("\n".join(lines))
+
+
+def damage(folder, how):
+    write(folder, [("a", "go", [0, 1]), ("b", "stop", [2, 3])])
+    how(folder)
+
+
+def small(folder):
+    picture(folder / "b" / "1.png", 3, size=(8, 8))
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        (
+            lambda f: (f / "episodes.jsonl").unlink(),
+            "jsonl does not exist: write one",
+        ),
+        (lambda f: (f / "episodes.jsonl").write_text("\n"), "lists no episode"),
+        (lambda f: (f / "episodes.jsonl").write_text("go"), "line 1: a line is a JSON object"),
+        (lambda f: (f / "episodes.jsonl").write_text('["a"]'), "line 1: a line is a JSON object"),
+        (lambda f: write(f, [("a", " ", [0, 1])]), "episode 'a' has no instruction"),
+        (lambda f: write(f, [("a", "go", [0, 1])] * 2), "lists episode 'a' 2 times"),
+        (lambda f: write(f, [("a", "go", [0, 1]), ("c", "go", [])]), "episode 'c' has no frames"),
+        (lambda f: [p.unlink() for p in (f / "b").iterdir()], "episode 'b' has no frames"),
+        (lambda f: (f / "b" / "1.png").unlink(), "episode 'b' has 1 frame"),
+        (small, "episode 'b': 1.png has 8x8 pixels, those of episode 'a' have 24x16"),
+        (
+            lambda f: (f / "b" / "1.png").write_bytes(b"no picture"),
+            "episode 'b': .* cannot be read",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said_with_the_name_of_the_episode(how, said, tmp_path):
+    damage(tmp_path, how)
+    with pytest.raises(UserError, match=said):
+        load_pictures(tmp_path)
+
+
+def test_an_unknown_word_names_its_episode(tmp_path):
+    write(tmp_path, [("a", "go", [0, 1]), ("b", "jump", [0, 1])])
+    with pytest.raises(UserError, match="episode 'b': unknown word 'jump'"):
+        load_pictures(tmp_path, vocabulary=Vocabulary(["go"]))
+
+
+def test_nothing_half_written_stays_behind(demos, tmp_path, monkeypatch):
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Image.Image, "save", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_pictures(demos, tmp_path / "shown")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("options", "said"), [({"kind": "tiff"}, "kind"), ({"scale": 0}, "scale")])
+def test_bad_options_are_refused(options, said, demos, tmp_path):
+    with pytest.raises(UserError, match=said):
+        save_pictures(demos, tmp_path / "shown", **options)
+
+
+def test_arrays_with_the_colours_last_are_recognised():
+    with pytest.raises(UserError, match=r"episode 0 .*colours last"):
+        Demonstrations.from_arrays([np.zeros((3, 16, 24, 3), np.uint8)], ["go"])
