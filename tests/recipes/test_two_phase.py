@@ -45,6 +45,18 @@ def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, pre
     assert [row["step"] for row in audit] == [1, 2]
     assert all("success" in row for row in audit)
 
+    # Its networks can be given away.
+    from share import share
+
+    shared = tmp_path / "shared"
+    folders = share(compose("share", f"task={task}", f"preset={preset}", f"to={shared}"))
+    assert {folder.name for folder in folders} >= {"policy", "inverse", "instruction"}
+    policy = networks.from_pretrained(shared / "policy", kind="policy")
+    trained = networks.load(run / "policy-phase2.safetensors")
+    assert all(map(torch.equal, policy.state_dict().values(), trained.state_dict().values()))
+    assert policy.vocabulary.decode(torch.tensor([[1]])) == ["circle"]
+    assert f"| Task | {task} |" in (shared / "policy" / "README.md").read_text()
+
     # A second call finds everything done.
     stamps = {path: path.stat().st_mtime_ns for path in run.rglob("*.safetensors")}
     assert two_phase(options) == results

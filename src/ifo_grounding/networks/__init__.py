@@ -25,6 +25,7 @@ from ifo_grounding.networks.persistence import load, save
 from ifo_grounding.networks.policy import PolicyNetwork, ValueNetwork, make_policy, make_value
 from ifo_grounding.networks.reward import RewardNetwork, make_reward_model
 from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.sharing import from_pretrained, save_pretrained
 
 __all__ = [
     "Blueprint",
@@ -46,6 +47,7 @@ __all__ = [
     "Shapes",
     "SpatialReadout",
     "ValueNetwork",
+    "from_pretrained",
     "load",
     "make_goal_judge",
     "make_instruction_classifier",
@@ -55,4 +57,5 @@ __all__ = [
     "make_value",
     "pool_cells",
     "save",
+    "save_pretrained",
 ]
