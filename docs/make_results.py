@@ -79,9 +79,10 @@ def study_section() -> list[str]:
         "Several training seeds each; greedy success on the same evaluation scenes in percent, with"
         " 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired by"
         " scene. `continued` and `cloned` are the [controls](phase2.md#controls). The columns"
-        " before the last hold each seed's share of suitable instructions among those chosen, and"
-        " of states served. p is that of no gain, corrected (Holm) for the tasks with as many"
-        " demonstrations.",
+        " before the last hold, for each seed, the share of suitable instructions among those"
+        " chosen, of states served, and of states that any instruction of the pool suits, by the"
+        " oracle: the most that could be served. p is that of no gain, corrected (Holm) for the"
+        " tasks with as many demonstrations.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table(rows),
         commands(found),
@@ -160,6 +161,7 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
     suitable = [run["results"]["suitability"] for run in runs]
     row["suitable"] = ", ".join(f"{100 * s['rate']['rate']:.1f}" for s in suitable)
     row["served"] = ", ".join(f"{100 * s['served']['rate']:.0f}" for s in suitable)
+    row["servable"] = ", ".join(f"{100 * s['servable']['rate']:.0f}" for s in suitable)
     return row
 
 

@@ -90,6 +90,12 @@ def load_network(run: Run, name: str, recipe: str, options: DictConfig) -> Any:
     return networks.load(run.need(name, recipe), device=options.device)
 
 
+def starting_policy(run: Run, options: DictConfig, section: str) -> Any:
+    """Return the phase-1 policy where a judge is to begin with its weights, else None."""
+    begins = options[section].init_from_policy
+    return load_network(run, POLICIES[0], "imitate", options) if begins else None
+
+
 def load_demonstrations(run: Run) -> Demonstrations:
     """Load the recorded demonstrations."""
     return Demonstrations.load(run.need(DEMONSTRATIONS, "record_demonstrations"))

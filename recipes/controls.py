@@ -1,6 +1,7 @@
 """What phase 2 has to beat: its compute spent on imitation, and cloning what the judge accepts."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -31,30 +32,35 @@ def continue_imitation(options: DictConfig) -> dict:
     """Imitate the demonstrations for as long again as phase 2 takes."""
     stage = open_stage(options, "continue_imitation", SECTIONS, NEEDS)
     if stage.result is None:
-        imitate_on(options, stage, CONTROLS[0], practice(stage.run, options)[0], None)
+        imitate_on(options, stage, CONTROLS[0])
     return stage.result or {}
 
 
 def clone_accepted(options: DictConfig) -> dict:
     """Imitate the demonstrations and the rollouts of phase 1 that the judge accepts."""
     stage = open_stage(options, "clone_accepted", SECTIONS, NEEDS)
-    if stage.result is None:
-        section, run = options.self_examine, stage.run
-        env, _, _ = practice(run, options)
-        rollouts = accepted_steps(
+
+    def rollouts(env: EnvBase) -> TensorDict:
+        section = options.self_examine
+        return accepted_steps(
             env,
-            load_network(run, POLICIES[0], "imitate", options),
+            load_network(stage.run, POLICIES[0], "imitate", options),
             iterations=section.iterations,
             steps=section.steps,
             seed=options.seed,
             threshold=options.controls.accept,
         )
-        imitate_on(options, stage, CONTROLS[1], env, rollouts)
+
+    if stage.result is None:
+        imitate_on(options, stage, CONTROLS[1], rollouts)
     return stage.result or {}
 
 
 def imitate_on(
-    options: DictConfig, stage: Stage, file: str, env: EnvBase, rollouts: TensorDict | None
+    options: DictConfig,
+    stage: Stage,
+    file: str,
+    rollouts: Callable[[EnvBase], TensorDict] | None = None,
 ) -> dict[str, Any]:
     """Train the phase-1 policy on, with as many gradient samples as phase 2, and save it.
 
@@ -63,24 +69,28 @@ def imitate_on(
     """
     section = options.self_examine
     policy = load_network(stage.run, POLICIES[0], "imitate", options)
-    buffer, _ = labelled_demonstrations(stage.run, options.imitate.held_out)
-    if rollouts is not None:
-        buffer = Both(buffer, rollouts)
+    env, _, _ = practice(stage.run, options)
     settings: dict[str, Any] = {"steps": matched_steps(options), "lr": options.controls.lr}
     selection = None
     if section.select_every:
+        # Before any rollout, so that it remembers the first starts.
         chosen = self_examination_config(section)
         selection = Selection(env, policy, chosen.selection, options.seed)
         selection.look()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)
         iteration = options.imitate.get("iteration", FitConfig.iteration)
         settings["validate_every"] = math.ceil(settings["steps"] / iteration / looks)
-    accepted = {} if rollouts is None else {"accepted": float(len(rollouts))}
+    buffer, _ = labelled_demonstrations(stage.run, options.imitate.held_out)
+    found = {}
+    if rollouts is not None:
+        accepted = rollouts(env)
+        buffer = Both(buffer, accepted)
+        found["accepted"] = float(len(accepted))
     longer = options.copy()
     OmegaConf.set_struct(longer, False)  # not every budget names all settings
     longer.imitate.update(settings)
     loss = ImitationLoss(policy)
-    return train(longer, stage, loss, buffer, "imitate", file, held_out=selection, **accepted)
+    return train(longer, stage, loss, buffer, "imitate", file, held_out=selection, **found)
 
 
 def matched_steps(options: DictConfig) -> int:

@@ -1,6 +1,6 @@
 """Train the goal judge: whether an instruction is fulfilled (an extension of the paper)."""
 
-from _shared import GOAL, POLICIES, build, load_demonstrations, load_network, open_stage, train
+from _shared import GOAL, build, load_demonstrations, open_stage, starting_policy, train
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
@@ -10,15 +10,12 @@ from ifo_grounding.objectives import GoalLoss
 
 
 def train_goal(options: DictConfig) -> dict:
-    starts_from_policy = options.goal.init_from_policy
-    needs = ["record_demonstrations", *(["imitate"] if starts_from_policy else [])]
+    needs = ["record_demonstrations", *(["imitate"] if options.goal.init_from_policy else [])]
     stage = open_stage(options, "train_goal", ["goal"], needs)
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
-    policy = (
-        load_network(stage.run, POLICIES[0], "imitate", options) if starts_from_policy else None
-    )
+    policy = starting_policy(stage.run, options, "goal")
     loss = GoalLoss(
         build(make_goal_judge, options, init_from=policy),
         demos.pool(),

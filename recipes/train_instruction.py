@@ -2,11 +2,10 @@
 
 from _shared import (
     CLASSIFIER,
-    POLICIES,
     build,
     load_demonstrations,
-    load_network,
     open_stage,
+    starting_policy,
     train,
 )
 from omegaconf import DictConfig
@@ -18,15 +17,15 @@ from ifo_grounding.objectives import InstructionLoss
 
 
 def train_instruction(options: DictConfig) -> dict:
-    starts_from_policy = options.instruction.init_from_policy
-    needs = ["record_demonstrations", *(["imitate"] if starts_from_policy else [])]
+    needs = [
+        "record_demonstrations",
+        *(["imitate"] if options.instruction.init_from_policy else []),
+    ]
     stage = open_stage(options, "train_instruction", ["instruction"], needs)
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
-    policy = (
-        load_network(stage.run, POLICIES[0], "imitate", options) if starts_from_policy else None
-    )
+    policy = starting_policy(stage.run, options, "instruction")
     loss = InstructionLoss(
         build(make_instruction_classifier, options, init_from=policy),
         demos.pool(),

@@ -46,7 +46,8 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
     solved = {"phase1": "f0", "phase2": "fc", "continued": "f8"}
     for seed in range(2):
         results = {name: {"outcomes": bits, "rate": {"count": 8}} for name, bits in solved.items()}
-        results["suitability"] = {"rate": {"rate": 0.9}, "served": {"rate": 0.5}}
+        rates = {"rate": 0.9, "served": 0.5, "servable": 0.6}
+        results["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
         options = {"task": "pick", "demonstrations": {"n": 2000}, "network": "strong", "seed": seed}
         run = {
             "options": options,

@@ -43,7 +43,7 @@ def test_drawing_beats_whole_tiles():
 
 
 def test_a_step_beats_the_rules_written_out():
-    state, action = random_layout(4096), torch.randint(6, (4096,))
+    state, action = random_layout(32_768), torch.randint(6, (32_768,))
 
     def plain():
         arm = neighbour(state.arm, action, state.size)[0]
@@ -56,7 +56,7 @@ def test_a_step_beats_the_rules_written_out():
     fast = step(state, action)
     for ours, theirs in zip((fast.arm, fast.held, fast.objects), plain(), strict=True):
         assert torch.equal(ours, theirs)
-    assert times_as_fast(lambda: step(state, action), plain) > 1.2  # measured: 2
+    assert times_as_fast(lambda: step(state, action), plain) > 1.2  # measured: 1.8
 
 
 def test_partial_resets_beat_choosing_pixel_by_pixel():

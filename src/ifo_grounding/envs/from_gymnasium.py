@@ -313,7 +313,8 @@ class GymnasiumEnv(EnvBase):
         rows = begins.nonzero().squeeze(-1)
         if len(rows):
             asked = None if tensordict is None else tensordict.get(keys.SCENE, None)
-            self._numbers[rows] = self._next(len(rows)) if asked is None else asked.view(-1)[rows]
+            numbers = self._next(len(rows)) if asked is None else asked.reshape(-1).cpu()[rows]
+            self._numbers[rows] = numbers
             seeds: list[int | None] = [None] * self.num_envs
             for row in rows.tolist():
                 seeds[row] = derive(self._seed, self.stream, int(self._numbers[row])) % 2**31
