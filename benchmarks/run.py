@@ -89,13 +89,13 @@ def main() -> None:
     chosen = options.rows or list(rows.ROWS)
     if unknown := set(chosen) - set(rows.ROWS):
         sys.exit(f"unknown rows {sorted(unknown)}: choose among {', '.join(rows.ROWS)}")
+    made = {**provenance(), "threads": options.threads, "device": options.device}
     measured = {}
     for name in chosen:
         measured[name] = measure_apart(name, options)
         print(text_table(shown(measured[name])), flush=True)
         if options.out:
             before = read_json(options.out)["rows"] if options.out.exists() else {}
-            made = {**provenance(), "threads": options.threads, "device": options.device}
             found = {**measured[name], "provenance": made}
             write_json(options.out, {"rows": {**before, name: found}})
 

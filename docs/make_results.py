@@ -194,6 +194,8 @@ def study_picture() -> Figure:
     """Draw what the studies compare."""
     groups = {}
     for (task, n, kind), runs in practised().items():
+        if ", " in kind:  # variants would hide what matters on one axis
+            continue
         known = [name for name in NAMES if all(name in run["results"] for run in runs)]
         title = f"{task}, {n:,} demonstrations, {kind}, seeds: {len(runs)}"
         groups[title] = {NAMES[name]: two_level_bootstrap(outcomes(runs, name)) for name in known}

@@ -36,32 +36,29 @@ def place(name: str) -> int:
     return ORDER.index(name) if name in ORDER else len(ORDER)
 
 
-def line(row: dict[str, Any]) -> dict[str, str]:
-    """Return a row of the table of rates."""
-    ours, others = OURS, [name for name in row["rates"] if name != OURS]
-    rate, reach = row["rates"][ours], row["reach"]
-    beside = [
-        f"{name}: {short(row['rates'][name]['median'])}, {times(row['ratios'][name])}"
-        for name in others
-    ]
-    asked = [
-        f"{short(value)}" if name == "rate" else f"{value:g} times {name}"
-        for name, value in reach.items()
-    ]
-    reached = [
-        rate["median"] >= value if name == "rate" else row["ratios"][name]["median"] >= value
-        for name, value in reach.items()
-        if name == "rate" or name in row["ratios"]
-    ]
-    return {
-        "what": row["name"] + (f" ({row['note']})" if row["note"] else ""),
-        "unit": row["unit"],
-        "here": f"**{short(rate['median'])}** [{short(rate['low'])}, {short(rate['high'])}]",
-        "beside, and how many times as fast this is": "<br>".join(beside) or "",
-        "asked": "<br>".join(asked),
-        "reached": ", ".join("yes" if found else "no" for found in reached),
-        "MB": f"{row['peak_mb'][ours]:,.0f}",
-    }
+def lines(row: dict[str, Any]) -> list[dict[str, str]]:
+    """Return the rows of the table of rates about one thing: ours, and what it is compared with."""
+    rates, reach = row["rates"], row["reach"]
+    asked = []
+    for name, value in reach.items():
+        found = rates[OURS] if name == "rate" else row["ratios"].get(name)
+        wanted = short(value) if name == "rate" else f"{value:g} times {name}"
+        verdict = "not run" if found is None else "yes" if found["median"] >= value else "no"
+        asked.append(f"{wanted}: {verdict}")
+    shown = []
+    for name in [OURS, *(other for other in rates if other != OURS)]:
+        rate, ours = rates[name], name == OURS
+        between = f"{short(rate['median'])} [{short(rate['low'])}, {short(rate['high'])}]"
+        shown.append(
+            {
+                "what": f"**{row['name']}**, {row['unit']}" if ours else "",
+                "by": f"**{name}**" if ours else name,
+                "rate": between,
+                "we are as fast": "" if ours else times(row["ratios"][name]),
+                "asked": "<br>".join(asked) if ours else "",
+            }
+        )
+    return shown
 
 
 def times(ratio: dict[str, float]) -> str:
@@ -90,7 +87,8 @@ def section() -> str:
         f"{row['provenance']['torch']}, commit `{row['provenance']['commit']}`"
         for row in rows.values()
     }
-    rates = [line(row) for row in rows.values() if row["rates"]]
+    rates = [shown for row in rows.values() if row["rates"] for shown in lines(row)]
+    notes = [f"- {row['name']}: {row['note']}." for row in rows.values() if row["note"]]
     facts = [
         {"what": row["name"], "measured": name, "value": f"{value:,.0f}"}
         for row in rows.values()
@@ -98,6 +96,7 @@ def section() -> str:
     ]
     parts = ["; ".join(sorted(made)) + ".", markdown_table(rates)]
     parts += [markdown_table(facts)] if facts else []
+    parts += ["\n".join(notes)] if notes else []
     return "\n\n".join(parts)
 
 
