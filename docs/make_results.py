@@ -106,7 +106,11 @@ def variant_section() -> list[str]:
 
 def module_section() -> list[str]:
     """Return what was compared of the instruction module alone."""
-    found = {key: runs for key, runs in studies().items() if "phase2" not in runs[0]["results"]}
+    found = {
+        key: runs
+        for key, runs in studies().items()
+        if "phase2" not in runs[0]["results"] and "suitability" in runs[0]["results"]
+    }
     rows = []
     for (task, n, kind), runs in found.items():
         for run in runs:
@@ -128,6 +132,40 @@ def module_section() -> list[str]:
         "## Instruction modules",
         "Suitable instructions among those chosen, and states served, by ways to train the"
         " [instruction module](phase2.md#the-instruction-module) from the same phase 1.",
+        markdown_table(rows),
+        commands(found),
+    ]
+
+
+def imitation_section() -> list[str]:
+    """Return what was compared of phase 1 alone."""
+    found = {
+        key: runs
+        for key, runs in studies().items()
+        if not {"phase2", "suitability"} & set(runs[0]["results"])
+    }
+    rows = []
+    for (task, n, kind), runs in found.items():
+        for run in runs:
+            success, options = run["results"]["phase1"], run["options"]
+            rows.append(
+                {
+                    "task": task,
+                    "demonstrations": f"{n:,}",
+                    "imitation": kind.partition(", ")[2] or kind,
+                    "steps": f"{options['imitate']['steps']:,}",
+                    "held out": f"{options['imitate']['held_out']:.0%}",
+                    "seed": options["seed"],
+                    "greedy": brief(restored(Rate, success["rate"])),
+                    "sampled": brief(restored(Rate, success["sampled"]["rate"])),
+                }
+            )
+    if not rows:
+        return []
+    return [
+        "## Variants of phase 1",
+        "When to [stop imitating](phase1.md#when-to-stop): success on 4,000 validation scenes, from"
+        " the same labels.",
         markdown_table(rows),
         commands(found),
     ]
@@ -218,7 +256,7 @@ def page(found: list[dict[str, Any]]) -> str:
         "Every number here comes from a file under `results/`, which holds all options, the seed,"
         " the commit and the machine. `python docs/make_results.py` writes this page from them.",
     ]
-    parts += [*study_section(), *variant_section(), *module_section()]
+    parts += study_section() + variant_section() + module_section() + imitation_section()
     for run in found:
         made = run["provenance"]
         parts += [

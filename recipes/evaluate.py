@@ -10,10 +10,12 @@ from _shared import (
     GOAL,
     POLICIES,
     REWARD,
+    keep_result,
     load_demonstrations,
     load_network,
     open_stage,
     world,
+    write_result,
 )
 from omegaconf import DictConfig
 from torch import Tensor
@@ -139,7 +141,10 @@ def evaluation_world(options: DictConfig) -> dict[str, Any]:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(results_table(evaluate(options)))
+    results = evaluate(options)
+    if options.results:
+        keep_result(options, write_result(options, results, "evaluate"))
+    print(results_table(results))
 
 
 if __name__ == "__main__":

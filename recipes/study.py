@@ -3,16 +3,14 @@
 python recipes/study.py task=move budget=study demonstrations.n=1000 seed=0 results=results/study
 """
 
-from pathlib import Path
-
-from _shared import open_run
+from _shared import keep_result, open_run, write_result
 from controls import clone_accepted, continue_imitation
 from evaluate import evaluate
 from omegaconf import DictConfig
-from two_phase import train_phases, write_result
+from two_phase import train_phases
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.files import read_json, write_json
+from ifo_grounding.files import read_json
 from ifo_grounding.report import results_table
 from ifo_grounding.report.audit import PANELS
 
@@ -26,11 +24,7 @@ def study(options: DictConfig) -> dict:
     content = write_result(options, results, "run study")
     if options.practise:
         content["audit"] = audit(options)
-    folder = options.results
-    if folder:
-        parts = [options.task, options.demonstrations.n, options.network, options.variant]
-        name = "-".join(str(part) for part in parts if part)
-        write_json(Path(folder) / f"{name}-seed{options.seed}.json", content)
+    keep_result(options, content)
     return results
 
 

@@ -1,8 +1,6 @@
 """Both phases on one task, and a report: the main job."""
 
-import sys
-
-from _shared import CONTROLS, POLICIES, open_run, plain
+from _shared import CONTROLS, POLICIES, open_run, plain, write_result
 from collect_transitions import collect
 from evaluate import evaluate
 from imitate import imitate
@@ -17,7 +15,7 @@ from train_reward import train_reward
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.files import write_json
-from ifo_grounding.report import provenance, results_table
+from ifo_grounding.report import results_table
 from ifo_grounding.training import Run
 from report import report
 
@@ -58,23 +56,6 @@ def train_phases(options: DictConfig) -> None:
         train_goal(options)
     if options.practise:
         examine(options)
-
-
-def write_result(options: DictConfig, results: dict, command: str) -> dict:
-    """Write one small file that says what was measured, by which command, where and how long."""
-    run = open_run(options)
-    stages = {p.stem: run.record(p.stem)["seconds"] for p in (run / "stages").glob("*.json")}
-    given = [text for text in sys.argv[1:] if "=" in text]
-    content = {
-        "command": " ".join(["ifo-grounding", command, *given]),
-        "options": plain(options),
-        "seconds": round(sum(stages.values()), 1),
-        "stages": stages,
-        "provenance": provenance(),
-        "results": results,
-    }
-    write_json(run / "result.json", content)
-    return content
 
 
 @recipe_main

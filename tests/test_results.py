@@ -31,8 +31,8 @@ def test_every_result_says_where_it_comes_from():
     script = load_script()
     studied = [run for seeds in script.studies().values() for run in seeds]
     for run in [*script.runs(), *studied]:
-        command = "run study" if run in studied else "demo"
-        assert run["command"].startswith(f"ifo-grounding {command}")
+        commands = ("run study", "evaluate") if run in studied else ("demo",)
+        assert any(run["command"].startswith(f"ifo-grounding {command}") for command in commands)
         assert run["provenance"]["commit"]
         assert not run["provenance"]["commit"].endswith("+"), "made from files that changed since"
         assert run["options"]["seed"] is not None
