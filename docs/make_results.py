@@ -78,7 +78,9 @@ def study_section() -> list[str]:
         "## Studies",
         "Several training seeds each; greedy success on the same evaluation scenes in percent, with"
         " 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired by"
-        " scene. `continued` and `cloned` are the [controls](phase2.md#controls). The columns"
+        " scene. Where demonstrations were held out, their likelihood stopped phase 1"
+        " ([too early](#variants-of-phase-1), as it turned out)."
+        " `continued` and `cloned` are the [controls](phase2.md#controls). The columns"
         " before the last hold, for each seed, the share of suitable instructions among those"
         " chosen, of states served, and of states that any instruction of the pool suits, by the"
         " oracle: the most that could be served. p is that of no gain, corrected (Holm) for the"
@@ -187,6 +189,7 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
         "preset": kind,
         "seeds": len(runs),
         "scenes": f"{both[0].shape[1]:,}{stream}",
+        "held out": f"{runs[0]['options']['imitate'].get('held_out', 0):.0%}",
         "phase 1": brief(two_level_bootstrap(both[0])),
         "phase 2": brief(two_level_bootstrap(both[1])),
         "gain, points": brief(paired_difference(*both)),

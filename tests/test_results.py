@@ -49,6 +49,7 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
         rates = {"rate": 0.9, "served": 0.5, "servable": 0.6}
         results["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
         options = {"task": "pick", "demonstrations": {"n": 2000}, "network": "strong", "seed": seed}
+        options["imitate"] = {"held_out": 0.0}
         run = {
             "options": options,
             "results": results,
