@@ -4,6 +4,7 @@ Reads ``results/*.json`` (the ``result.json`` of runs) and writes ``docs/results
 of ``README.md`` between its two marks. A test checks that both are up to date.
 """
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -68,12 +69,9 @@ def outcomes(runs: list[dict[str, Any]], name: str) -> np.ndarray:
 
 def study_section() -> list[str]:
     """Return what the studies over seeds found."""
-    found = {key: runs for key, runs in practised().items() if ", " not in key[2]}
-    rows = [study_row(key, runs) for key, runs in found.items()]
+    rows = study_rows()
     if not rows:
         return []
-    for row, p_value in zip(rows, adjusted(found), strict=True):
-        row["p"] = p_value
     return [
         "## Studies",
         "Several training seeds each; greedy success on the same evaluation scenes in percent, with"
@@ -87,13 +85,21 @@ def study_section() -> list[str]:
         " tasks with as many demonstrations.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table(rows),
-        commands(found),
+        commands(practised()),
     ]
+
+
+@functools.cache
+def study_rows() -> list[dict[str, Any]]:
+    """Compare the policies of every study; resampling takes seconds, and two pages show it."""
+    found = practised()
+    rows = [study_row(key, runs) for key, runs in found.items()]
+    return [{**row, "p": p} for row, p in zip(rows, adjusted(found), strict=True)]
 
 
 def variant_section() -> list[str]:
     """Return what was compared of phase 2 on validation or evaluation scenes."""
-    found = {key: runs for key, runs in practised().items() if ", " in key[2]}
+    found = practised(variants=True)
     rows = [study_row(key, runs, scenes=True) for key, runs in found.items()]
     if not rows:
         return []
@@ -173,9 +179,13 @@ def imitation_section() -> list[str]:
     ]
 
 
-def practised() -> dict[Key, list[dict[str, Any]]]:
-    """Return the studies whose policy has practised."""
-    return {key: runs for key, runs in studies().items() if "phase2" in runs[0]["results"]}
+def practised(variants: bool = False) -> dict[Key, list[dict[str, Any]]]:
+    """Return the studies whose policy has practised: those of the presets, or their variants."""
+    return {
+        key: runs
+        for key, runs in studies().items()
+        if "phase2" in runs[0]["results"] and (", " in key[2]) == variants
+    }
 
 
 def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dict[str, Any]:
@@ -235,8 +245,6 @@ def study_picture() -> Figure:
     """Draw what the studies compare."""
     groups = {}
     for (task, n, kind), runs in practised().items():
-        if ", " in kind:  # variants would hide what matters on one axis
-            continue
         known = [name for name in NAMES if all(name in run["results"] for run in runs)]
         title = f"{task}, {n:,} demonstrations, {kind}, seeds: {len(runs)}"
         groups[title] = {NAMES[name]: two_level_bootstrap(outcomes(runs, name)) for name in known}
@@ -279,8 +287,8 @@ def readme(text: str) -> str:
     _, _, after = rest.partition(MARKS[1])
     shown = ("task", "demonstrations", "seeds", "phase 1", "phase 2")
     against = ("over continued", "over cloned")
-    rows = [study_row(key, runs) for key, runs in practised().items() if ", " not in key[2]]
-    table = markdown_table([{name: row[name] for name in (*shown, *against)} for row in rows])
+    rows = [{name: row[name] for name in (*shown, *against)} for row in study_rows()]
+    table = markdown_table(rows)
     return f"{before}{MARKS[0]}\n{table}\n{MARKS[1]}{after}"
 
 

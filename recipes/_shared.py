@@ -16,8 +16,6 @@ from torchrl.data import ReplayBuffer
 from ifo_grounding import networks
 from ifo_grounding.data import Demonstrations, LabelReport
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.files import write_json
-from ifo_grounding.report import provenance
 from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.training.supervised import Validation
@@ -153,31 +151,6 @@ def self_examination_config(section: DictConfig) -> SelfExaminationConfig:
 def plain(node: Any) -> Any:
     """Return options as dicts, lists and numbers."""
     return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-
-
-def write_result(options: DictConfig, results: dict, command: str) -> dict:
-    """Write one small file that says what was measured, by which command, where and how long."""
-    run = open_run(options)
-    stages = {p.stem: run.record(p.stem)["seconds"] for p in (run / "stages").glob("*.json")}
-    given = [text for text in sys.argv[1:] if "=" in text]
-    content = {
-        "command": " ".join(["ifo-grounding", command, *given]),
-        "options": plain(options),
-        "seconds": round(sum(stages.values()), 1),
-        "stages": stages,
-        "provenance": provenance(),
-        "results": results,
-    }
-    write_json(run / "result.json", content)
-    return content
-
-
-def keep_result(options: DictConfig, content: dict) -> None:
-    """Write what was measured into the folder of results, where one is named."""
-    if options.results:
-        parts = [options.task, options.demonstrations.n, options.network, options.variant]
-        name = "-".join(str(part) for part in parts if part)
-        write_json(Path(options.results) / f"{name}-seed{options.seed}.json", content)
 
 
 def _known(section: DictConfig, kind: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from _shared import (
 )
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig, OmegaConf
-from self_examine import practice
+from self_examine import needs, practice
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
@@ -24,13 +24,12 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.training import FitConfig, Rehearsal, Selection, Stage, accepted_steps
 
-NEEDS = ["imitate", "train_instruction", "train_goal"]
 SECTIONS = ["imitate", "self_examine", "instruction", "controls"]
 
 
 def continue_imitation(options: DictConfig) -> dict:
     """Imitate the demonstrations for as long again as phase 2 takes."""
-    stage = open_stage(options, "continue_imitation", SECTIONS, NEEDS)
+    stage = open_stage(options, "continue_imitation", SECTIONS, needs(options))
     if stage.result is None:
         imitate_on(options, stage, CONTROLS[0])
     return stage.result or {}
@@ -38,7 +37,7 @@ def continue_imitation(options: DictConfig) -> dict:
 
 def clone_accepted(options: DictConfig) -> dict:
     """Imitate the demonstrations and the rollouts of phase 1 that the judge accepts."""
-    stage = open_stage(options, "clone_accepted", SECTIONS, NEEDS)
+    stage = open_stage(options, "clone_accepted", SECTIONS, needs(options))
 
     def rollouts(env: EnvBase) -> TensorDict:
         section = options.self_examine

@@ -4,18 +4,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from _results import keep_result, write_result
 from _shared import (
     CLASSIFIER,
     CONTROLS,
     GOAL,
     POLICIES,
     REWARD,
-    keep_result,
     load_demonstrations,
     load_network,
     open_stage,
     world,
-    write_result,
 )
 from omegaconf import DictConfig
 from torch import Tensor

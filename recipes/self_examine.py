@@ -34,11 +34,7 @@ from ifo_grounding.transforms import InstructionSampler, LearnedReward, Starting
 
 def examine(options: DictConfig) -> dict:
     section = options.self_examine
-    judges = {"action": ["train_reward"], "goal": ["train_goal"]}.get(
-        section.kind, ["train_reward", "train_goal"]
-    )
-    needs = ["imitate", "train_instruction", *judges]
-    stage = open_stage(options, "self_examine", ["self_examine", "instruction"], needs)
+    stage = open_stage(options, "self_examine", ["self_examine", "instruction"], needs(options))
     if stage.result is not None:
         return stage.result
     run = stage.run
@@ -61,6 +57,14 @@ def examine(options: DictConfig) -> dict:
     )
     networks.save(policy, run / POLICIES[1])
     return stage.finish(history[-1], history)
+
+
+def needs(options: DictConfig) -> list[str]:
+    """Return the stages that practice builds on."""
+    judges = {"action": ["train_reward"], "goal": ["train_goal"]}.get(
+        options.self_examine.kind, ["train_reward", "train_goal"]
+    )
+    return ["imitate", "train_instruction", *judges]
 
 
 def rehearsal(policy: nn.Module, run: Run, options: DictConfig) -> Rehearsal | None:

@@ -3,7 +3,8 @@
 python recipes/study.py task=move budget=study demonstrations.n=1000 seed=0 results=results/study
 """
 
-from _shared import keep_result, open_run, write_result
+from _results import keep_result, write_result
+from _shared import open_run
 from controls import clone_accepted, continue_imitation
 from evaluate import evaluate
 from omegaconf import DictConfig

@@ -1,6 +1,7 @@
 """Both phases on one task, and a report: the main job."""
 
-from _shared import CONTROLS, POLICIES, open_run, plain, write_result
+from _results import write_result
+from _shared import CONTROLS, POLICIES, open_run, plain
 from collect_transitions import collect
 from evaluate import evaluate
 from imitate import imitate

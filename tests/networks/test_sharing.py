@@ -8,28 +8,17 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.networks import (
     Shapes,
     from_pretrained,
-    make_goal_judge,
-    make_instruction_classifier,
     make_inverse,
     make_policy,
-    make_reward_model,
-    make_value,
     save_pretrained,
 )
 from ifo_grounding.tasks import VOCABULARY
+from networks.conftest import MAKERS
 
 SHAPES = Shapes(image_shape=(3, 16, 16), vocabulary_size=len(VOCABULARY))
-MAKERS = (
-    make_policy,
-    make_value,
-    make_inverse,
-    make_instruction_classifier,
-    make_reward_model,
-    make_goal_judge,
-)
 
 
-@pytest.mark.parametrize("make", MAKERS)
+@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 def test_a_shared_network_comes_back_with_its_words(make, tmp_path):
     network = make(SHAPES, seed=0)
     folder = save_pretrained(network, tmp_path / "mine", vocabulary=VOCABULARY)

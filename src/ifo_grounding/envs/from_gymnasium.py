@@ -320,9 +320,7 @@ class GymnasiumEnv(EnvBase):
                 seeds[row] = derive(self._seed, self.stream, int(self._numbers[row])) % 2**31
             seen, _ = self.worlds.reset(seed=seeds, options={"reset_mask": begins.numpy()})
             self._seen = seen
-        return self._observed(
-            **{name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS}
-        ).exclude(keys.REWARD)
+        return self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS})
 
     def _next(self, count: int) -> Tensor:
         first = self._next_number
