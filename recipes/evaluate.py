@@ -22,7 +22,9 @@ from torch import Tensor
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import record_demonstrations
 from ifo_grounding.evaluation import (
+    compare_endings,
     compare_success,
+    episode_endings,
     return_correlation,
     reward_audit,
     success_rate,
@@ -49,7 +51,8 @@ def evaluate(options: DictConfig) -> dict:
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
     results: dict[str, Any] = {"labels": run.record("label")["result"]["accuracy"]}
     results |= evaluate_policies(run, options)
-    if (run / CLASSIFIER).exists():
+    results |= evaluate_endings(run, options)
+    if options.evaluate.states and (run / CLASSIFIER).exists():
         results["suitability"] = evaluate_choices(run, options)
     results |= evaluate_judges(run, options)
     return stage.finish(results)
@@ -79,6 +82,27 @@ def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
     torch.save(torch.stack(phases), run / "outcomes.pt")
     if "phase2" in measured:
         results["gain"] = compare_success(measured["phase1"], measured["phase2"]).as_dict()
+    return results
+
+
+def evaluate_endings(run: Run, options: DictConfig) -> dict[str, Any]:
+    """Say how the greedy episodes of each phase end, and what phase 2 changes."""
+    section = options.evaluate
+    found = {
+        phase: episode_endings(
+            load_network(run, file, "imitate", options),
+            options.task,
+            episodes=section.episodes,
+            seed=section.seed,
+            stream=section.stream,
+            **evaluation_world(options),
+        )
+        for phase, file in zip(("phase1", "phase2"), POLICIES, strict=True)
+        if (run / file).exists()
+    }
+    results: dict[str, Any] = {"endings": {name: end.as_dict() for name, end in found.items()}}
+    if len(found) > 1:
+        results["changes"] = compare_endings(*found.values())
     return results
 
 

@@ -4,6 +4,7 @@ import importlib.util
 from pathlib import Path
 
 from ifo_grounding.files import write_json
+from ifo_grounding.stats import wilson
 
 ROOT = Path(__file__).parents[1]
 
@@ -27,9 +28,15 @@ def test_the_table_of_speeds_is_up_to_date():
         assert path.read_text() == text, f"{path.name}: run python docs/make_speed.py"
 
 
+def test_the_tables_of_the_paper_are_up_to_date():
+    for path, text in load_script("make_tables").written().items():
+        assert path.read_text() == text, f"{path.name}: run python docs/make_tables.py"
+
+
 def test_every_result_says_where_it_comes_from():
     script = load_script()
     studied = [run for seeds in script.studies().values() for run in seeds]
+    studied += [run for seeds in load_script("make_tables").pieces().values() for run in seeds]
     for run in [*script.runs(), *studied]:
         commands = ("run study", "evaluate") if run in studied else ("demo",)
         assert any(run["command"].startswith(f"ifo-grounding {command}") for command in commands)
@@ -63,3 +70,53 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
     table = "\n".join(script.study_section())
     for shown in ("| pick | 2,000 | strong | 2 |", "50.0%", "75.0%", "+25.0", "+12.5", "not run"):
         assert shown in table
+
+
+def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
+    script = load_script("make_tables")
+    folder = tmp_path / "results" / "tables"
+    folder.mkdir(parents=True)
+
+    def rate(successes, count):
+        return wilson(successes, count).as_dict()
+
+    def solved(bits):
+        return {"outcomes": bits, "rate": {"count": 8}}
+
+    suitability = {"rate": rate(60, 80), "served": rate(80, 100), "servable": rate(90, 100)}
+    suitability["errors"] = {"missing": 15, "occupied": 5}
+    results = {
+        "phase-1": {"phase1": solved("f0"), "suitability": suitability},
+        "pairs-5000": {
+            "phase1": solved("f0"),
+            "phase2": solved("fc"),
+            "changes": {
+                "gained": {"stuck": 2},
+                "lost": {"stuck": 0},
+                "other path": 1,
+                "same path": 3,
+            },
+        },
+    }
+    for phase, found in results.items():
+        piece = {
+            "options": {"task": "pick", "network": "strong", "variant": phase},
+            "results": found,
+            "command": f"ifo-grounding run study variant={phase}",
+            "provenance": {"commit": "abc", "machine": "a machine"},
+            "seconds": 600,
+        }
+        write_json(folder / f"{phase}.json", piece)
+    monkeypatch.setattr(script, "ROOT", tmp_path)
+    text = script.content()
+    for shown in (
+        "| `strong` | 1 | 50.0%",
+        "75.0% [",
+        "<br>+25.0 [",
+        "| pick | 90.2% | not run | not run | not run | 75.0% [",
+        "| pick | `strong` | 15 | 0 | 0 | 5 | 0 | 0 |",
+        "| phase 2 alone | pick | `strong` | 2 | 0 | 0 | 0 |",
+        "| pick | `strong` | 1 | 3 |",
+        "13.0% [10.3, 16.2]",
+    ):
+        assert shown in text

@@ -3,6 +3,7 @@
 Evaluation reads the truth (scenes, goals, rewards); learners never import it.
 """
 
+from ifo_grounding.evaluation.endings import Endings, compare_endings, episode_endings
 from ifo_grounding.evaluation.labels import LabelAccuracy, label_accuracy
 from ifo_grounding.evaluation.recording import Episode, record_episodes
 from ifo_grounding.evaluation.reward import (
@@ -32,6 +33,7 @@ from ifo_grounding.stats import (
 
 __all__ = [
     "Difference",
+    "Endings",
     "Episode",
     "Estimate",
     "LabelAccuracy",
@@ -41,8 +43,10 @@ __all__ = [
     "SuccessResult",
     "SuitabilityResult",
     "auc",
+    "compare_endings",
     "compare_success",
     "correlation",
+    "episode_endings",
     "evaluating",
     "holm",
     "judged_choices",

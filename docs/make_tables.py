@@ -1,0 +1,211 @@
+"""Write the paper's tables with the numbers of here: ``python docs/make_tables.py``.
+
+Reads ``results/tables/*.json``, the pieces of the recipe `reproduce`, and writes the part of
+``docs/tables.md`` between its two marks. A test checks that it is up to date.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ifo_grounding.files import atomic_write, read_json
+from ifo_grounding.report import markdown_table
+from ifo_grounding.report.results import restored
+from ifo_grounding.stats import Rate, paired_difference, two_level_bootstrap, wilson
+from ifo_grounding.tasks import TASKS
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "tables.md"
+MARKS = ("<!-- tables -->", "<!-- /tables -->")
+PRESETS = ("paper", "strong")
+PAPER_EPISODES = 500
+"""The paper's rates are multiples of 0.2%: they look like this many episodes each."""
+TABLE_2 = {
+    "move": (76.6, 79.4, 78.4),
+    "move-udlr": (69.0, 73.4, 72.4),
+    "pick": (13.0, 15.0, 15.4),
+    "pick-out": (32.8, 34.0, 34.6),
+    "pick-udlr": (22.6, 26.0, 24.8),
+}
+TABLE_3 = dict(zip(TASKS, (91.725, 81.145, 90.190, 77.940, 76.810), strict=True))
+TABLE_4 = dict(
+    zip(TASKS, ((62.8, 68.4), (56.8, 60.6), (11.2, 14.6), (27.4, 29.8), (19.8, 21.0)), strict=True)
+)
+ERRORS = ("missing", "ambiguous", "out of bounds", "occupied", "already true", "unachievable")
+FAILURES = ("stuck", "wrong object", "wrong place", "nothing done")
+NOT_RUN = "not run"
+
+Pieces = dict[tuple[str, str, str], list[dict[str, Any]]]
+
+
+def pieces() -> Pieces:
+    """Return the committed seeds of each task, preset and phase."""
+    found: Pieces = {}
+    for path in sorted((ROOT / "results" / "tables").glob("*.json")):
+        run = read_json(path)
+        options = run["options"]
+        found.setdefault((options["task"], options["network"], options["variant"]), []).append(run)
+    return found
+
+
+def outcomes(runs: list[dict[str, Any]], name: str) -> np.ndarray:
+    """Return the success of a policy on every scene, bool [seeds, scenes]."""
+    rows = []
+    for run in runs:
+        result = run["results"][name]
+        bits = np.unpackbits(np.frombuffer(bytes.fromhex(result["outcomes"]), np.uint8))
+        rows.append(bits[: result["rate"]["count"]].astype(bool))
+    return np.stack(rows)
+
+
+def success(runs: list[dict[str, Any]] | None, name: str) -> str:
+    """Return a policy's success over its seeds and, of phase 2, the paired gain."""
+    if not runs:
+        return NOT_RUN
+    rate = brief(two_level_bootstrap(outcomes(runs, name)))
+    if name == "phase1":
+        return rate
+    gain = paired_difference(outcomes(runs, "phase1"), outcomes(runs, name))
+    return f"{rate}<br>{brief(gain)} points"
+
+
+def of_paper(percent: float) -> str:
+    """Return a rate of the paper with the interval that its number of episodes implies."""
+    return brief(wilson(round(percent / 100 * PAPER_EPISODES), PAPER_EPISODES))
+
+
+def success_rows(
+    found: Pieces, reported: dict[str, tuple[float, ...]], phases: tuple[str, ...], heads: list[str]
+) -> list[dict[str, str]]:
+    """Return the paper's rates and ours, one row each: of phase 1, then of phase 2."""
+    rows = []
+    for task in TASKS:
+        told = [of_paper(percent) for percent in reported[task]]
+        rows.append({"task": f"**{task}**", "by": "the paper", "seeds": ""})
+        rows[-1] |= dict(zip(heads, told, strict=True))
+        for preset in PRESETS:
+            runs = [found.get((task, preset, phase)) for phase in phases]
+            shown = ["phase1", *["phase2"] * (len(phases) - 1)]
+            values = [success(some, name) for some, name in zip(runs, shown, strict=True)]
+            seeds = str(max((len(some) for some in runs if some), default=""))
+            rows.append({"task": "", "by": f"`{preset}`", "seeds": seeds})
+            rows[-1] |= dict(zip(heads, values, strict=True))
+    return rows
+
+
+def suitability_rows(found: Pieces) -> list[dict[str, str]]:
+    """Return the rows of Table 3."""
+    rows = []
+    for task in TASKS:
+        row = {"task": task, "the paper": f"{TABLE_3[task]:.1f}%"}
+        for preset in PRESETS:
+            runs = found.get((task, preset, "phase-1"), [])
+            for name, title in (
+                ("rate", "suitable"),
+                ("served", "served"),
+                ("servable", "at most"),
+            ):
+                values = [brief(restored(Rate, r["results"]["suitability"][name])) for r in runs]
+                row[f"`{preset}`: {title}"] = "<br>".join(values) or NOT_RUN
+        rows.append(row)
+    return rows
+
+
+def counted(
+    found: Pieces,
+    phase: str,
+    names: tuple[str, ...],
+    read: Callable[[dict[str, Any]], dict[str, int]],
+) -> list[dict[str, str]]:
+    """Return rows of counts by name, added over seeds, of what was run."""
+    rows = []
+    for task in TASKS:
+        for preset in PRESETS:
+            if runs := found.get((task, preset, phase)):
+                counts = [read(run["results"]) for run in runs]
+                added = {name: f"{sum(some.get(name, 0) for some in counts):,}" for name in names}
+                rows.append({"task": task, "preset": f"`{preset}`", **added})
+    return rows
+
+
+def change_rows(found: Pieces) -> list[dict[str, str]]:
+    """Return the rows of Fig. 6."""
+    rows = []
+    for part, title in (("gained", "phase 2 alone"), ("lost", "phase 1 alone")):
+        some = counted(
+            found, "pairs-5000", FAILURES, lambda results, part=part: results["changes"][part]
+        )
+        rows += [{"solved by": title, **row} for row in some]
+    return sorted(rows, key=lambda row: TASKS.index(row["task"]))
+
+
+def table(rows: list[dict[str, str]]) -> str:
+    return markdown_table(rows) if rows else "Not run yet."
+
+
+def content() -> str:
+    """Return the part of the page that the results decide."""
+    found = pieces()
+    phases = ["phase 1", "phase 2, 5,000 pairs", "phase 2, 10,000 pairs"]
+    path_rows = counted(
+        found,
+        "pairs-5000",
+        ("other path", "same path"),
+        lambda results: {name: results["changes"][name] for name in ("other path", "same path")},
+    )
+    parts = [
+        "## Table 2: success",
+        table(success_rows(found, TABLE_2, ("phase-1", "pairs-5000", "pairs-10000"), phases)),
+        "## Table 3: suitable instructions",
+        "Of the instructions chosen for 20,000 fresh states, the share that is suitable, and the"
+        " share of states that got one. `at most` is the share of states that any instruction of"
+        " the demonstrations suits, by the oracle.",
+        table(suitability_rows(found)),
+        "## Table 4: zero-shot",
+        "Instructions that mention at least one of three colour-shape pairs which no instruction of"
+        " the demonstrations mentions.",
+        table(success_rows(found, TABLE_4, ("zero-shot", "zero-shot-pairs-5000"), phases[:2])),
+        "## Figure 5: what is wrong with unsuitable choices",
+        table(counted(found, "phase-1", ERRORS, lambda results: results["suitability"]["errors"])),
+        "## Figure 6: what phase 2 changes",
+        "Scenes that only one of the two policies solves, by what the other one did there.",
+        table(change_rows(found)),
+        "Scenes that both solve, by another path or by the same:",
+        table(path_rows),
+        commands(found),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def commands(found: Pieces) -> str:
+    """Return by what each result was made, folded away."""
+    made = [
+        f"- `{run['command']}` (commit `{run['provenance']['commit']}`, "
+        f"{run['seconds'] / 60:.0f} minutes, {run['provenance']['machine']})"
+        for runs in found.values()
+        for run in runs
+    ]
+    return "\n".join(['??? note "Commands"', "", *(f"    {line}" for line in made)]) if made else ""
+
+
+def brief(value: Any) -> str:
+    return str(value).rpartition(" (")[0].replace(" points", "")
+
+
+def written() -> dict[Path, str]:
+    """Return what the page should say."""
+    before, _, rest = PAGE.read_text().partition(MARKS[0])
+    _, _, after = rest.partition(MARKS[1])
+    return {PAGE: f"{before}{MARKS[0]}\n\n{content()}\n\n{MARKS[1]}{after}"}
+
+
+def main() -> None:
+    for path, text in written().items():
+        with atomic_write(path) as temporary:
+            temporary.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""The paper's tables and figures: every run they need, piece by piece, and what is missing yet.
+
+python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
+"""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from _shared import plain
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.files import home, read_json
+
+PHASES = ("phase-1", "pairs-5000", "pairs-10000")
+ZERO_SHOT = ("zero-shot", "zero-shot-pairs-5000")
+WANTED = {
+    ("table", 2): PHASES,
+    ("table", 3): PHASES[:1],
+    ("table", 4): ZERO_SHOT,
+    ("figure", 5): PHASES[:1],
+    ("figure", 6): PHASES[:2],
+}
+"""Pieces that each table and figure of the paper is made from; the first has phase 1."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One call of the recipe `study` that leaves one small file of results."""
+
+    run: str
+    arguments: tuple[str, ...]
+    file: Path
+
+    @property
+    def done(self) -> bool:
+        """Whether its file is there and was made by the same call."""
+        command = " ".join(["ifo-grounding", "run", "study", *self.arguments])
+        return self.file.exists() and read_json(self.file)["command"] == command
+
+    def make(self) -> int:
+        """Make it in a process of its own, at one thread; what it prints goes to a file."""
+        if self.done:
+            return 0
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, str(Path(__file__).with_name("study.py")), *self.arguments]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        with self.log.open("w") as log:
+            return subprocess.run(
+                command, env=environment, stdout=log, stderr=subprocess.STDOUT, check=False
+            ).returncode
+
+    @property
+    def log(self) -> Path:
+        """Where its output goes."""
+        return home() / "runs" / f"{self.run}.log"
+
+
+def pieces(options: DictConfig) -> list[list[Piece]]:
+    """Return the pieces of the tables and figures asked for: chains, each from one phase 1."""
+    phases = wanted_phases(options)
+    for preset in options.presets:
+        check_choice("preset", preset, options.options_of.preset)
+    return [
+        list(chain(options, task, preset, seed, phases))
+        for seed, preset, task in product(options.seeds, options.presets, options.tasks)
+    ]
+
+
+def wanted_phases(options: DictConfig) -> list[str]:
+    """Return the phases that the tables and figures asked for need, in order."""
+    asked = [(kind, options[kind]) for kind in ("table", "figure") if options[kind] is not None]
+    if not asked:
+        raise UserError("name a table=2, 3 or 4, or a figure=5 or 6, of the paper")
+    for kind, number in asked:
+        check_choice(kind, number, [of for which, of in WANTED if which == kind])
+    needed = {phase for key in asked for phase in WANTED[key]}
+    return [phase for phase in (*PHASES, *ZERO_SHOT) if phase in needed]
+
+
+def chain(
+    options: DictConfig, task: str, preset: str, seed: int, phases: list[str]
+) -> Iterator[Piece]:
+    """Yield the pieces of one task, preset and seed, each phase 1 before what builds on it."""
+    sections = options.options_of
+    for phase in phases:
+        first = ZERO_SHOT[0] if phase in ZERO_SHOT else PHASES[0]
+        names = {part: f"tables-{task}-{preset}-{part}-seed{seed}" for part in (phase, first)}
+        given = {
+            "task": task,
+            "preset": preset,
+            "seed": seed,
+            "demonstrations.n": options.demonstrations,
+            "run": names[phase],
+            "variant": phase,
+            "results": options.results,
+            **({} if phase == first else {"base": names[first]}),
+            **flat(sections.all),
+            **flat(sections.preset[preset]),
+            **flat(sections.phase[phase]),
+        }
+        arguments = tuple(f"{name}={value}" for name, value in given.items())
+        file = Path(options.results) / f"{task}-{options.demonstrations}-{preset}-{phase}"
+        yield Piece(names[phase], arguments, Path(f"{file}-seed{seed}.json"))
+
+
+def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any]:
+    """Return the options of a section and of those below it, by their full names."""
+    found: dict[str, Any] = {}
+    for name, value in plain(section).items():
+        full = above + name
+        found |= flat(value, f"{full}.") if isinstance(value, dict) else {full: value}
+    return found
+
+
+def reproduce(options: DictConfig) -> list[Piece]:
+    """Make what is missing, chains side by side; return what could not be made."""
+    chains = pieces(options)
+    total = sum(map(len, chains))
+    if options.list:
+        for piece in (piece for chain in chains for piece in chain):
+            print("done   " if piece.done else "not run", piece.file)
+        return []
+    failed: list[Piece] = []
+    with (
+        tqdm(total=total, unit="piece", disable=not options.progress) as bar,
+        ThreadPoolExecutor(options.jobs) as pool,
+    ):
+
+        def run(chain: list[Piece]) -> None:
+            for piece in chain:
+                bar.set_postfix_str(piece.file.stem)
+                if piece.make():
+                    failed.append(piece)
+                    return
+                bar.update()
+
+        list(pool.map(run, chains))
+    return failed
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    if failed := reproduce(options):
+        listed = ", ".join(str(piece.log) for piece in failed)
+        raise UserError(f"pieces that ended with an error left the rest of their chains: {listed}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,203 @@
+"""How episodes end, and what another policy does in the same scenes (paper, Fig. 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from ifo_grounding import keys
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation.episodes import (
+    MAX_STEPS,
+    Outcomes,
+    Policy,
+    SceneHash,
+    device_of,
+    play,
+    scene_batches,
+    seeded,
+)
+from ifo_grounding.modules import evaluating
+from ifo_grounding.seeding import derive
+from ifo_grounding.tasks.goals import SIDES, Goal, Plan
+from ifo_grounding.tasks.grammar import grammar
+from ifo_grounding.world import SHAPES, WorldState, neighbour
+
+ENDINGS = ("success", "stuck", "wrong object", "wrong place", "nothing done")
+"""How an episode can end. `stuck`: it never stopped. `nothing done`: it stopped without having
+moved the object that it was to carry."""
+SUCCESS, STUCK, WRONG_OBJECT, WRONG_PLACE, NOTHING_DONE = range(5)
+SHARED = ("both", "colour", "shape", "neither")
+"""What a wrong object has in common with the right one: both if it lies in another box."""
+
+
+@dataclass(frozen=True)
+class Endings:
+    """How each of N episodes ended, one per scene; everything on the CPU."""
+
+    kind: Tensor
+    """Index into :data:`ENDINGS`, int64 [N]."""
+    wanted: Tensor
+    """Kind of the object that the instruction is about, 1..12, int64 [N]."""
+    mistaken: Tensor
+    """Kind of the object that was gone to or carried in its place, else 0, int64 [N]."""
+    actions: Tensor
+    """What was done, int8 [N, max_steps]; -1 after the end."""
+    scenes: str
+    """Hash of the first frames and instructions of all scenes."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Episodes by how they ended."""
+        return _counts(self.kind)
+
+    @property
+    def shared(self) -> dict[str, int]:
+        """Wrong objects by what they have in common with the right one."""
+        wrong = self.kind == WRONG_OBJECT
+        colours, shapes = _looks(self.mistaken[wrong]), _looks(self.wanted[wrong])
+        same_colour, same_shape = (a == b for a, b in zip(colours, shapes, strict=True))
+        found = (3 - 2 * same_colour.long() - same_shape.long()).bincount(minlength=len(SHARED))
+        return dict(zip(SHARED, found.tolist(), strict=True))
+
+    def as_dict(self) -> dict[str, dict[str, int]]:
+        """Return plain values for JSON: the two counts."""
+        return {"counts": self.counts, "shared": self.shared}
+
+
+def episode_endings(
+    policy: Policy,
+    task: str,
+    *,
+    mode: str = "greedy",
+    episodes: int = 2000,
+    seed: int = 0,
+    stream: str = "evaluation",
+    batch_size: int = 1000,
+    device: torch.device | str | None = None,
+    max_steps: int = MAX_STEPS,
+    **env_options: Any,
+) -> Endings:
+    """Play the scenes of :func:`success_rate` and say how each episode ended.
+
+    Args:
+        policy: writes an action.
+        task: name of the task.
+        mode: ``greedy`` or ``sampled``.
+        episodes: number of scenes.
+        seed: of the scenes and, where sampled, of the actions.
+        stream: ``training``, ``validation`` or ``evaluation``.
+        batch_size: episodes side by side.
+        device: where to run; the policy's by default.
+        max_steps: most actions per episode.
+        env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
+
+    >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
+    >>> episode_endings(stop, "pick", episodes=50).counts["nothing done"]
+    50
+    """
+    options = {"batch_size": batch_size, "max_steps": max_steps, **env_options}
+    options["device"] = torch.device(device) if device is not None else device_of(policy)
+    scenes, parts = SceneHash(), []
+    batches = scene_batches(task, range(episodes), seed=seed, stream=stream, **options)
+    for number, (env, start, count) in enumerate(batches):
+        assert isinstance(env, PickAndPlaceEnv)
+        scenes.update(start, count)
+        with evaluating(policy), seeded(derive(seed, "success", mode, number), options["device"]):
+            parts.append([column[:count].cpu() for column in _play(policy, env, start, mode)])
+    kind, wanted, mistaken, actions = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Endings(kind, wanted, mistaken, actions, scenes.hexdigest())
+
+
+def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
+    """Count what changed from one policy to another, scene by scene.
+
+    Returns:
+        ``gained``: scenes that only the second solves, by how the first one's episode ended;
+        ``lost``: scenes that only the first solves, by how the second one's ended; ``other path``
+        and ``same path``: scenes that both solve.
+
+    Raises:
+        UserError: where the two are about different scenes.
+    """
+    if before.scenes != after.scenes:
+        raise UserError("the two are about different scenes: use the same seed and stream")
+    solved = before.kind == SUCCESS, after.kind == SUCCESS
+    same = (before.actions == after.actions).all(1)
+    return {
+        "gained": _counts(before.kind[~solved[0] & solved[1]]),
+        "lost": _counts(after.kind[solved[0] & ~solved[1]]),
+        "other path": int((solved[0] & solved[1] & ~same).sum()),
+        "same path": int((solved[0] & solved[1] & same).sum()),
+    }
+
+
+def _play(
+    policy: Policy, env: PickAndPlaceEnv, start: TensorDictBase, mode: str
+) -> Iterator[Tensor]:
+    """Yield how each row's episode ended, wanted and mistaken objects [B], and actions [B, T]."""
+    scene = env.simulator.scene
+    assert scene is not None
+    first, wanted = scene.state.clone(), scene.wanted.clone()
+    goal = grammar(env.task).parse_tokens(start[keys.INSTRUCTION])
+    last = first.clone()
+    shape = (env.num_envs, env.options.max_steps)
+    actions = torch.full(shape, -1, dtype=torch.int8, device=env.device)
+    taken = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
+
+    def keep(rows: Tensor, transition: TensorDictBase) -> None:
+        assert env.simulator.scene is not None
+        last[rows] = env.simulator.scene.state[rows]
+        actions[rows, taken[rows]] = transition[keys.ACTION].to(torch.int8)
+        taken[rows] += 1
+
+    outcomes = play(policy, env, start, mode=mode, max_steps=shape[1], on_step=keep)
+    kind, mistaken = _ending(first, last, wanted, goal, outcomes)
+    yield from (kind, goal.object, mistaken, actions)
+
+
+def _ending(
+    first: WorldState, last: WorldState, wanted: Plan, goal: Goal, outcomes: Outcomes
+) -> tuple[Tensor, Tensor]:
+    """Return how episodes ended, index into ENDINGS [B], and wrong objects [B]."""
+    gone_to = _gone_to(last, goal)
+    carried = _carried(first, last, wanted, goal)
+    mistaken = torch.where(goal.carries, carried, gone_to)
+    untouched = goal.carries & (last.objects == first.objects).all(-1) & (last.held == 0)
+    kind = torch.where(mistaken > 0, WRONG_OBJECT, WRONG_PLACE)
+    kind = torch.where(untouched, NOTHING_DONE, kind)
+    kind = torch.where(outcomes.stopped, kind, STUCK)
+    kind = torch.where(outcomes.success, SUCCESS, kind)
+    return kind, torch.where(kind == WRONG_OBJECT, mistaken, 0)
+
+
+def _gone_to(last: WorldState, goal: Goal) -> Tensor:
+    """Return the kind of the object that the arm stands at, in the way that a goal asks for."""
+    opposite = (goal.side + len(SIDES) // 2) % len(SIDES)
+    beside, inside = neighbour(last.arm, opposite, last.size)
+    cell = torch.where(goal.has_side, beside, last.arm)
+    found = last.objects.gather(-1, cell.unsqueeze(-1)).squeeze(-1).long()
+    return torch.where(inside | ~goal.has_side, found, 0)
+
+
+def _carried(first: WorldState, last: WorldState, wanted: Plan, goal: Goal) -> Tensor:
+    """Return the kind of an object, other than the one to be carried, that was moved; else 0."""
+    others = first.objects.scatter(-1, wanted.object_cell.unsqueeze(-1), 0)
+    gone = (others > 0) & (last.objects != others)
+    return others.gather(-1, gone.byte().argmax(-1, keepdim=True)).squeeze(-1).long() * gone.any(-1)
+
+
+def _looks(kinds: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the numbers of the colours and of the shapes of object kinds."""
+    return (kinds - 1) // len(SHAPES), (kinds - 1) % len(SHAPES)
+
+
+def _counts(kinds: Tensor) -> dict[str, int]:
+    found = kinds.bincount(minlength=len(ENDINGS)).tolist()
+    return dict(zip(ENDINGS, found, strict=True))

@@ -1,0 +1,151 @@
+import pytest
+import torch
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import compare_endings, episode_endings, success_rate
+from ifo_grounding.evaluation.endings import ENDINGS
+from ifo_grounding.tasks.grammar import grammar
+from ifo_grounding.world import SHAPES
+
+U, R, D, L, P, S = range(6)
+EPISODES = 100
+
+
+class Scripted:
+    """A policy that does, in each row, what a rule says at the start; play asks running rows."""
+
+    def __init__(self, task, rule):
+        env = PickAndPlaceEnv(task, EPISODES, seed=0, stream="evaluation")
+        env.reset()
+        scene = env.simulator.scene
+        goals = grammar(task).parse_tokens(scene.instruction)
+        self.plans = [rule(scene[row], goals[row]) for row in range(EPISODES)]
+        self.step = 0
+
+    def __call__(self, td):
+        actions = [plan[self.step] for plan in self.plans if len(plan) > self.step]
+        self.step += 1
+        return td.set("action", torch.tensor(actions))
+
+
+def way(start, end):
+    down, right = int(end) // 6 - int(start) // 6, int(end) % 6 - int(start) % 6
+    return [D if down > 0 else U] * abs(down) + [R if right > 0 else L] * abs(right)
+
+
+def stop(scene, goal):
+    return [S]
+
+
+def never_stop(scene, goal):
+    return [U] * 40
+
+
+def solve(scene, goal):
+    start, item, end = scene.state.arm, scene.wanted.object_cell, scene.wanted.destination
+    if not goal.carries:
+        return [*way(start, end), S]
+    return [*way(start, item), P, *way(item, end), P, S]
+
+
+def solve_by_a_detour(scene, goal):
+    return [*([D, U] if scene.state.arm < 6 else [U, D]), *solve(scene, goal)]
+
+
+def other_cell(scene):
+    """Return the first cell of another object."""
+    objects = scene.state.objects.clone()
+    objects[scene.wanted.object_cell] = 0
+    return objects.bool().byte().argmax()
+
+
+def carry_another(scene, goal):
+    start, item = scene.state.arm, other_cell(scene)
+    return [*way(start, item), P, S]
+
+
+def drop_elsewhere(scene, goal):
+    start, item = scene.state.arm, scene.wanted.object_cell
+    taken = scene.state.objects.bool()
+    taken[scene.wanted.destination] = True
+    empty = taken.byte().argmin()
+    return [*way(start, item), P, *way(item, empty), P, S]
+
+
+def go_to_another(scene, goal):
+    """Stand beside another object as one should beside the right one, if the grid has the cell."""
+    cell = int(other_cell(scene))
+    row, column = divmod(cell, 6)
+    row, column = row + (-1, 0, 1, 0)[goal.side], column + (0, 1, 0, -1)[goal.side]
+    if goal.has_side and 0 <= row < 6 and 0 <= column < 6:
+        cell = 6 * row + column
+    return [*way(scene.state.arm, cell), S]
+
+
+def endings(task, rule):
+    return episode_endings(Scripted(task, rule), task, episodes=EPISODES)
+
+
+@pytest.mark.parametrize("task", ["move", "move-udlr", "pick", "pick-out", "pick-udlr"])
+def test_solutions_are_successes_and_walking_on_is_being_stuck(task):
+    assert endings(task, solve).counts["success"] == EPISODES
+    counts = endings(task, never_stop).counts
+    assert sum(counts.values()) == EPISODES
+    # Walking on may end where the arm should be, which counts at the last step.
+    assert counts["stuck"] + counts["success"] == EPISODES
+
+
+@pytest.mark.parametrize("task", ["pick", "pick-out", "pick-udlr"])
+def test_what_a_carrying_episode_did_instead(task):
+    assert endings(task, stop).counts["nothing done"] == EPISODES
+    another = endings(task, carry_another)
+    assert another.counts["wrong object"] == EPISODES
+    assert (another.mistaken > 0).all()
+    assert endings(task, drop_elsewhere).counts["wrong place"] == EPISODES
+
+
+def test_what_a_walking_episode_did_instead():
+    assert endings("move", go_to_another).counts["wrong object"] == EPISODES
+    beside = endings("move-udlr", go_to_another).counts
+    assert beside["wrong object"] > EPISODES / 2
+    assert endings("move-udlr", stop).counts["wrong place"] > EPISODES / 2
+
+
+def test_wrong_objects_are_counted_by_what_they_share():
+    found = endings("move", go_to_another)
+    colour = (found.mistaken - 1) // len(SHAPES) == (found.wanted - 1) // len(SHAPES)
+    shape = (found.mistaken - 1) % len(SHAPES) == (found.wanted - 1) % len(SHAPES)
+    assert found.shared == {
+        "both": 0,
+        "colour": int((colour & ~shape).sum()),
+        "shape": int((shape & ~colour).sum()),
+        "neither": int((~shape & ~colour).sum()),
+    }
+    assert sum(found.shared.values()) == EPISODES
+    assert found.shared["colour"] > 0 and found.shared["shape"] > 0
+
+
+def test_scenes_and_successes_are_those_of_success_rate():
+    found = endings("pick", solve)
+    rate = success_rate(Scripted("pick", solve), "pick", episodes=EPISODES)
+    assert found.scenes == rate.scenes
+    assert (found.kind == ENDINGS.index("success")).equal(rate.outcomes)
+    assert ((found.actions >= 0).sum(1)).equal(rate.lengths)
+
+
+def test_changes_between_two_policies():
+    direct, detour, halted = (endings("pick", rule) for rule in (solve, solve_by_a_detour, stop))
+    changes = compare_endings(halted, direct)
+    assert changes["gained"]["nothing done"] == EPISODES
+    assert sum(changes["lost"].values()) == changes["other path"] == changes["same path"] == 0
+    assert compare_endings(direct, halted)["lost"]["nothing done"] == EPISODES
+    assert compare_endings(direct, detour)["other path"] == EPISODES
+    assert compare_endings(direct, direct)["same path"] == EPISODES
+
+
+def test_other_scenes_cannot_be_compared():
+    first = endings("move", stop)
+    stopping = lambda td: td.set("action", torch.full(td.shape, S))  # noqa: E731
+    with pytest.raises(UserError, match="different scenes"):
+        compare_endings(first, episode_endings(stopping, "move", episodes=10))

@@ -1,0 +1,83 @@
+import pytest
+from hydra import compose, initialize_config_dir
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.files import read_json
+
+TINY = {
+    "all.budget": "tiny",
+    "all.evaluate.episodes": 50,
+    "preset.strong.inverse.steps": 20,
+    "preset.strong.imitate.steps": 20,
+    "preset.strong.instruction.steps": 10,
+    "preset.strong.goal.steps": 10,
+    "preset.strong.self_examine.iterations": 1,
+    "phase.phase-1.evaluate.states": 50,
+    "phase.pairs-5000.self_examine.pairs": 20,
+}
+
+
+@pytest.fixture
+def options(recipes, tmp_path, monkeypatch):
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path))
+
+    def composed(*overrides):
+        tiny = [f"options_of.{name}={value}" for name, value in TINY.items()]
+        given = ["demonstrations=300", f"results={tmp_path / 'results'}", "progress=false"]
+        with initialize_config_dir(version_base=None, config_dir=str(recipes / "conf")):
+            return compose("reproduce", [*given, *tiny, *overrides])
+
+    return composed
+
+
+def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, tmp_path):
+    from reproduce import pieces, reproduce
+
+    asked = options("figure=6", "tasks=[move]", "presets=[strong]")
+    ((first, second),) = pieces(asked)
+    assert not first.done
+    assert reproduce(asked) == []
+    assert first.done and second.done
+    before, after = read_json(first.file)["results"], read_json(second.file)["results"]
+    assert before["phase1"] == after["phase1"]
+    assert before["suitability"]["served"]["count"] == 50 and "suitability" not in after
+    assert sum(after["endings"]["phase2"]["counts"].values()) == 50
+    assert {"gained", "lost", "other path", "same path"} == set(after["changes"])
+
+    written = second.file.stat().st_mtime_ns
+    assert reproduce(asked) == []
+    assert second.file.stat().st_mtime_ns == written
+    # Other options, another piece.
+    ((_, changed),) = pieces(
+        options("figure=6", "tasks=[move]", "presets=[strong]", "options_of.all.threads=2")
+    )
+    assert changed.file == second.file and not changed.done
+
+
+def test_a_piece_that_fails_ends_its_chain(options):
+    from reproduce import reproduce
+
+    asked = options("table=3", "tasks=[juggle, move]", "presets=[strong]", "jobs=1", "seeds=[1]")
+    (failed,) = reproduce(asked)
+    assert "juggle" in failed.log.read_text()
+    assert failed.run == "tables-juggle-strong-phase-1-seed1"
+
+
+def test_listing_runs_nothing(options, capsys):
+    from reproduce import reproduce
+
+    assert reproduce(options("table=2", "list=true", "seeds=[0,1]")) == []
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5 * 2 * 2 * 3
+    assert all(line.startswith("not run") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [([], "name a table"), (["table=7"], "table"), (["table=2", "presets=[huge]"], "huge")],
+)
+def test_what_cannot_be_reproduced_is_refused(options, given, said):
+    from reproduce import pieces
+
+    with pytest.raises(UserError, match=said):
+        pieces(options(*given))
