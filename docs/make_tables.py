@@ -1,7 +1,8 @@
 """Write the paper's tables with the numbers of here: ``python docs/make_tables.py``.
 
-Reads ``results/tables/*.json``, the pieces of the recipe `reproduce`, and writes the part of
-``docs/tables.md`` between its two marks. A test checks that it is up to date.
+Reads ``results/tables/*.json``, the pieces of the recipe `reproduce`, and writes the parts of
+``docs/tables.md`` and ``docs/zero-shot.md`` between their marks. A test checks that they are up to
+date.
 """
 
 from collections.abc import Callable
@@ -15,11 +16,12 @@ from ifo_grounding.report import markdown_table
 from ifo_grounding.report.results import restored
 from ifo_grounding.stats import Rate, paired_difference, two_level_bootstrap, wilson
 from ifo_grounding.tasks import TASKS
+from ifo_grounding.tasks.grammar import HOLDOUTS
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tables.md"
-MARKS = ("<!-- tables -->", "<!-- /tables -->")
-PRESETS = ("paper", "strong")
+ZERO_SHOT = ROOT / "docs" / "zero-shot.md"
+PRESETS = ("paper", "strong", "grounded")
 PAPER_EPISODES = 500
 """The paper's rates are multiples of 0.2%: they look like this many episodes each."""
 TABLE_2 = {
@@ -194,11 +196,68 @@ def brief(value: Any) -> str:
     return str(value).rpartition(" (")[0].replace(" points", "")
 
 
+def zero_shot_content() -> str:
+    """Return the part of the page on zero-shot that the results decide."""
+    found = pieces()
+    rows = []
+    for task in TASKS:
+        for preset in PRESETS:
+            for phase, piece in (("phase1", "zero-shot"), ("phase2", "zero-shot-pairs-5000")):
+                if runs := found.get((task, preset, piece)):
+                    rows.append(zero_shot_row(runs, phase))
+    return table(rows)
+
+
+def zero_shot_row(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
+    """Return success on held-out and on trained pairs, and where the agent went instead."""
+    options = runs[0]["options"]
+    held_out = [run["results"]["endings"][phase] for run in runs]
+    trained = [run["results"]["trained"][phase]["counts"] for run in runs]
+    of_trained = wilson(
+        sum(counts["success"] for counts in trained),
+        sum(sum(counts.values()) for counts in trained),
+    )
+    objects = HOLDOUTS[options["world"]["holdout"]]
+    each = {
+        name: [ends["by_object"][name] for ends in held_out if name in ends["by_object"]]
+        for name in objects
+    }
+    row = {
+        "task": options["task"],
+        "preset": f"`{options['network']}`",
+        "phase": phase[-1],
+        "seeds": str(len(runs)),
+        "held-out pairs": brief(two_level_bootstrap(outcomes(runs, phase))),
+        "trained pairs": brief(of_trained),
+        "each held-out pair": "<br>".join(
+            f"{name} {100 * sum(w for w, _ in won) / sum(n for _, n in won):.1f}%"
+            for name, won in each.items()
+            if won
+        ),
+    }
+    total = sum(sum(ends["counts"].values()) for ends in held_out)
+    for name in FAILURES:
+        share = sum(ends["counts"][name] for ends in held_out) / total
+        row[name] = f"{100 * share:.1f}%"
+    shared = [
+        f"{sum(e['shared'][k] for e in held_out)} {k}" for k in ("colour", "shape", "neither")
+    ]
+    row["wrong objects share"] = ", ".join(shared)
+    return row
+
+
 def written() -> dict[Path, str]:
-    """Return what the page should say."""
-    before, _, rest = PAGE.read_text().partition(MARKS[0])
-    _, _, after = rest.partition(MARKS[1])
-    return {PAGE: f"{before}{MARKS[0]}\n\n{content()}\n\n{MARKS[1]}{after}"}
+    """Return what each page should say."""
+    parts = {PAGE: ("tables", content()), ZERO_SHOT: ("zero-shot", zero_shot_content())}
+    return {path: between(path.read_text(), *part) for path, part in parts.items()}
+
+
+def between(text: str, mark: str, renewed: str) -> str:
+    """Return a page with the part between two marks renewed."""
+    first, last = f"<!-- {mark} -->", f"<!-- /{mark} -->"
+    before, _, rest = text.partition(first)
+    _, _, after = rest.partition(last)
+    return f"{before}{first}\n\n{renewed}\n\n{last}{after}"
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ from torch import Tensor
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import record_demonstrations
 from ifo_grounding.evaluation import (
+    Endings,
     compare_endings,
     compare_success,
     episode_endings,
@@ -86,24 +87,35 @@ def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
 
 
 def evaluate_endings(run: Run, options: DictConfig) -> dict[str, Any]:
-    """Say how the greedy episodes of each phase end, and what phase 2 changes."""
+    """Say how the greedy episodes of each phase end, and what phase 2 changes.
+
+    Of a zero-shot evaluation, the same of instructions that name trained pairs alone.
+    """
+    found = endings(run, options, options.evaluate.split)
+    results: dict[str, Any] = {"endings": {name: end.as_dict() for name, end in found.items()}}
+    if len(found) > 1:
+        results["changes"] = compare_endings(*found.values())
+    if options.evaluate.split == "zero-shot":
+        trained = endings(run, options, "train")
+        results["trained"] = {name: end.as_dict() for name, end in trained.items()}
+    return results
+
+
+def endings(run: Run, options: DictConfig, split: str) -> dict[str, Endings]:
+    """Play the scenes of a split with the policy of each phase."""
     section = options.evaluate
-    found = {
+    return {
         phase: episode_endings(
             load_network(run, file, "imitate", options),
             options.task,
             episodes=section.episodes,
             seed=section.seed,
             stream=section.stream,
-            **evaluation_world(options),
+            **{**world(options), "split": split},
         )
         for phase, file in zip(("phase1", "phase2"), POLICIES, strict=True)
         if (run / file).exists()
     }
-    results: dict[str, Any] = {"endings": {name: end.as_dict() for name, end in found.items()}}
-    if len(found) > 1:
-        results["changes"] = compare_endings(*found.values())
-    return results
 
 
 def packed(outcomes: Tensor) -> str:

@@ -18,12 +18,13 @@ from ifo_grounding.report.audit import PANELS
 
 def study(options: DictConfig) -> dict:
     train_phases(options)
-    if options.practise and options.controls.run:
+    practised = options.phase2 and options.practise
+    if practised and options.controls.run:
         continue_imitation(options)
         clone_accepted(options)
     results = evaluate(options)
     content = write_result(options, results, "run study")
-    if options.practise:
+    if practised:
         content["audit"] = audit(options)
     keep_result(options, content)
     return results

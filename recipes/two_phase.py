@@ -49,6 +49,8 @@ def train_phases(options: DictConfig) -> None:
     record(options)
     label(options)
     imitate(options)
+    if not options.phase2:
+        return
     # Phase 2: self-examination.
     train_instruction(options)
     if options.self_examine.kind != "goal":

@@ -1,4 +1,4 @@
-"""What every part does with modules that it is handed: find their device, run them in eval mode."""
+"""What every part does with modules that it is handed: device, eval mode, what they charge for."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 
 @contextlib.contextmanager
@@ -44,3 +44,22 @@ def device_of(module: object) -> torch.device | None:
         for tensor in (*module.parameters(), *module.buffers()):
             return tensor.device
     return None
+
+
+def take_charge(module: nn.Module) -> Tensor | None:
+    """Take what the parts of a module charge for their last batch, None where none does.
+
+    A part charges by leaving a ``charge``, a tensor of one number, when it computes in train mode.
+
+    >>> part = nn.Linear(1, 1)
+    >>> part.charge = torch.tensor(2.0)
+    >>> take_charge(nn.Sequential(part)), take_charge(part)
+    (tensor(2.), None)
+    """
+    total: Tensor | None = None
+    for part in module.modules():
+        charge = getattr(part, "charge", None)
+        if isinstance(charge, Tensor):
+            total = charge if total is None else total + charge
+            part.charge = None  # type: ignore[assignment]
+    return total

@@ -6,7 +6,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import compare_endings, episode_endings, success_rate
 from ifo_grounding.evaluation.endings import ENDINGS
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.world import SHAPES
+from ifo_grounding.world import SHAPES, kind_name
 
 U, R, D, L, P, S = range(6)
 EPISODES = 100
@@ -132,6 +132,9 @@ def test_scenes_and_successes_are_those_of_success_rate():
     assert found.scenes == rate.scenes
     assert (found.kind == ENDINGS.index("success")).equal(rate.outcomes)
     assert ((found.actions >= 0).sum(1)).equal(rate.lengths)
+    assert sum(count for _, count in found.by_object.values()) == EPISODES
+    assert all(won == count for won, count in found.by_object.values())
+    assert set(found.by_object) <= {kind_name(number) for number in range(1, 13)}
 
 
 def test_changes_between_two_policies():

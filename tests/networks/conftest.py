@@ -35,7 +35,7 @@ def kind(request):
     return request.param
 
 
-@pytest.fixture(params=["strong", "paper"])
+@pytest.fixture(params=["strong", "grounded", "paper"])
 def preset(request):
     return request.param
 

@@ -121,6 +121,7 @@ def test_place_matters_to_a_policy(shapes):
     assert (logits[0] - logits[1]).abs().max() > 1e-3
 
 
+@pytest.mark.parametrize("preset", ["strong", "paper"])
 def test_an_instruction_module_begins_with_what_the_policy_learned(shapes, preset):
     policy = make_policy(shapes, preset, seed=0)
     classifier = make_instruction_classifier(shapes, preset, init_from=policy, seed=1)
@@ -136,6 +137,13 @@ def test_an_instruction_module_begins_with_what_the_policy_learned(shapes, prese
     assert all(torch.equal(trunk.fusion.state_dict()[name], w) for name, w in fusion.items())
     with pytest.raises(UserError, match="does not fit"):
         make_instruction_classifier(shapes, preset, init_from=policy, embedding=5)
+
+
+@pytest.mark.parametrize("make", [make_instruction_classifier, make_goal_judge])
+def test_a_judge_of_sentences_cannot_begin_with_a_reader_of_words(shapes, make):
+    policy = make_policy(shapes, "grounded", seed=0)
+    with pytest.raises(UserError, match="word by word"):
+        make(shapes, "grounded", init_from=policy)
 
 
 @pytest.mark.parametrize("preset", ["strong", "paper"])

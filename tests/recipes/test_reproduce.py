@@ -68,7 +68,7 @@ def test_listing_runs_nothing(options, capsys):
 
     assert reproduce(options("table=2", "list=true", "seeds=[0,1]")) == []
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 5 * 2 * 2 * 3
+    assert len(lines) == 5 * 3 * 2 * 3
     assert all(line.startswith("not run") for line in lines)
 
 

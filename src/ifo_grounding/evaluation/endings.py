@@ -27,7 +27,7 @@ from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.goals import SIDES, Goal, Plan
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.world import SHAPES, WorldState, neighbour
+from ifo_grounding.world import SHAPES, WorldState, kind_name, neighbour
 
 ENDINGS = ("success", "stuck", "wrong object", "wrong place", "nothing done")
 """How an episode can end. `stuck`: it never stopped. `nothing done`: it stopped without having
@@ -66,9 +66,18 @@ class Endings:
         found = (3 - 2 * same_colour.long() - same_shape.long()).bincount(minlength=len(SHARED))
         return dict(zip(SHARED, found.tolist(), strict=True))
 
-    def as_dict(self) -> dict[str, dict[str, int]]:
-        """Return plain values for JSON: the two counts."""
-        return {"counts": self.counts, "shared": self.shared}
+    @property
+    def by_object(self) -> dict[str, tuple[int, int]]:
+        """Successes and episodes by the object that the instruction is about."""
+        rows = ((kind_name(int(number)), self.wanted == number) for number in self.wanted.unique())
+        return {
+            name: (int((self.kind[asked] == SUCCESS).sum()), int(asked.sum()))
+            for name, asked in rows
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON: the counts."""
+        return {"counts": self.counts, "shared": self.shared, "by_object": self.by_object}
 
 
 def episode_endings(

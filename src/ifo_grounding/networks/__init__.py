@@ -19,6 +19,11 @@ from ifo_grounding.networks.fusion import (
     pool_cells,
 )
 from ifo_grounding.networks.goal import make_goal_judge
+from ifo_grounding.networks.grounding import (
+    ColourAndForm,
+    GroundedTrunk,
+    WordMaps,
+)
 from ifo_grounding.networks.instruction import PairScorer, make_instruction_classifier
 from ifo_grounding.networks.inverse import InverseNetwork, make_inverse
 from ifo_grounding.networks.persistence import load, save
@@ -31,10 +36,12 @@ __all__ = [
     "Blueprint",
     "CellCount",
     "CellLinear",
+    "ColourAndForm",
     "ConvEncoder",
     "ConvInstructionEncoder",
     "GRUInstructionEncoder",
     "GatedAttention",
+    "GroundedTrunk",
     "InstructionEncoder",
     "InverseNetwork",
     "NetworkConfig",
@@ -47,6 +54,7 @@ __all__ = [
     "Shapes",
     "SpatialReadout",
     "ValueNetwork",
+    "WordMaps",
     "from_pretrained",
     "load",
     "make_goal_judge",

@@ -20,7 +20,8 @@ class NetworkConfig:
     """
 
     preset: str
-    """``"paper"`` (strided convolutions, gated attention) or ``"strong"`` (patches, FiLM)."""
+    """``"paper"`` (strided convolutions, gated attention), ``"strong"`` (patches, FiLM), or
+    ``"grounded"``: as strong, but for policy and critic, which read word by word."""
     features: int
     """Channels of the feature map."""
     conv_layers: int
@@ -39,6 +40,11 @@ class NetworkConfig:
     """Values that each attention map reads (``strong``)."""
     detectors: int
     """Kinds of cells that the instruction module and the goal judge count (``strong``)."""
+    matching: str
+    """How an instruction meets cells: ``"sentence"``, as one vector, or ``"words"``, each by
+    itself (:class:`~ifo_grounding.networks.WordMaps`)."""
+    maps: int
+    """Maps that words add their evidence to (``matching="words"``)."""
     words: str
     """``"gru"`` (the paper's) or ``"conv"``: how a sentence is encoded."""
     embedding: int
@@ -54,6 +60,7 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, PRESETS)
+        check_choice("matching", self.matching, ("sentence", "words"))
         check_choice("words", self.words, ("gru", "conv"))
         check_choice("precision", self.precision, ("auto", "fp32", "bf16"))
         for name in ("features", "embedding", "hidden"):
@@ -90,6 +97,8 @@ _PAPER: dict[str, Any] = {
     "heads": 0,
     "values": 0,
     "detectors": 0,
+    "matching": "sentence",
+    "maps": 0,
     "words": "gru",
     "embedding": 8,
     "hidden": 64,
@@ -106,17 +115,27 @@ _STRONG: dict[str, Any] = {
     "heads": 8,
     "values": 16,
     "detectors": 32,
+    "matching": "sentence",
+    "maps": 0,
     "words": "conv",
     "embedding": 32,
     "hidden": 64,
     "dropout": 0.0,
     "head_hidden": (128,),
 }
+_INVERSE: dict[str, Any] = {**_STRONG, "features": 32, "n_blocks": 0, "context": 2}
+_GROUNDED: dict[str, Any] = {**_STRONG, "matching": "words", "maps": 8}
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "paper": {**dict.fromkeys(KINDS, _PAPER), "value": {**_PAPER, "dropout": 0.0}},
     "strong": {
         **dict.fromkeys(KINDS, _STRONG),
-        "inverse": {**_STRONG, "features": 32, "n_blocks": 0, "context": 2},
+        "inverse": _INVERSE,
+    },
+    "grounded": {
+        **dict.fromkeys(KINDS, _STRONG),
+        "inverse": _INVERSE,
+        "policy": _GROUNDED,
+        "value": _GROUNDED,
     },
 }
 """Values by preset and kind. A critic has no dropout: its targets would be noise."""

@@ -55,6 +55,52 @@ class ConvEncoder(nn.Module):
         return height, width
 
 
+def patches(image: Tensor, patch: int) -> Tensor:
+    """Cut an image [N, C, H, W] into patches [N, h, w, C * patch * patch].
+
+    An image whose sides are not multiples of the patch is padded with black to the right and below.
+
+    >>> patches(torch.zeros(2, 3, 20, 28), 8).shape
+    torch.Size([2, 3, 4, 192])
+    """
+    return _cut(_padded(image, patch), patch, patch)
+
+
+def distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
+    """Cut images into their distinct patches; None where that would not pay.
+
+    It pays on a CPU, for images of bytes in which more than half of the patches repeat.
+
+    Args:
+        image: [N, C, H, W].
+        patch: pixels along one side of a patch.
+
+    Returns:
+        Distinct patches, uint8 [U, C, patch * patch], and which lies where, int64 [N, h * w].
+    """
+    plain = image.dtype == torch.uint8 and image.device.type == "cpu"
+    if not plain or patch % WORD or hidden_from_python(image):
+        return None
+    words = _padded(image, patch).contiguous().view(torch.int64)
+    cut = _cut(words, patch, patch // WORD)
+    rows, index = distinct_rows(cut.flatten(0, 2))
+    if 2 * len(rows) > len(index):
+        return None
+    distinct = rows.view(torch.uint8).unflatten(1, (-1, patch**2))
+    return distinct, index.view(cut.shape[:3]).flatten(1)
+
+
+def _cut(image: Tensor, height: int, width: int) -> Tensor:
+    """Cut [N, C, H, W] into [N, h, w, C * height * width]."""
+    cells = image.unflatten(-1, (-1, width)).unflatten(-3, (-1, height))
+    return cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
+
+
+def _padded(image: Tensor, patch: int) -> Tensor:
+    below, right = (-size % patch for size in image.shape[-2:])
+    return F.pad(image, (0, right, 0, below)) if below or right else image
+
+
 class PatchEncoder(nn.Module):
     """One feature vector per patch, the same wherever the patch lies.
 
@@ -73,8 +119,7 @@ class PatchEncoder(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w], channels last in memory."""
-        patches = self._patches(self._padded(image), self.patch)
-        return self.embed(as_float(patches)).permute(0, 3, 1, 2)
+        return self.embed(as_float(patches(image, self.patch))).permute(0, 3, 1, 2)
 
     def cells(
         self, image: Tensor, complete: Callable[[Tensor], Tensor] | None = None
@@ -87,28 +132,13 @@ class PatchEncoder(nn.Module):
             image: [N, C, H, W].
             complete: makes what is embedded out of distinct patches, uint8 [U, C, patch * patch].
         """
-        plain = image.dtype == torch.uint8 and image.device.type == "cpu"
-        if not plain or self.patch % WORD or hidden_from_python(image):
+        found = distinct_patches(image, self.patch)
+        if found is None:
             return None
-        words = self._padded(image).contiguous().view(torch.int64)
-        patches = self._patches(words, self.patch // WORD)
-        rows, index = distinct_rows(patches.flatten(0, 2))
-        if 2 * len(rows) > len(index):
-            return None
-        distinct = rows.view(torch.uint8)
+        distinct, index = found
         if complete is not None:
-            distinct = complete(distinct.unflatten(1, (-1, self.patch**2))).flatten(1)
-        features = self.embed(as_float(distinct))
-        return Cells(features, index.view(patches.shape[:3]).flatten(1))
-
-    def _patches(self, image: Tensor, width: int) -> Tensor:
-        """Cut [N, C, H, W] into [N, h, w, C * patch * width]."""
-        cells = image.unflatten(-1, (-1, width)).unflatten(-3, (-1, self.patch))
-        return cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
-
-    def _padded(self, image: Tensor) -> Tensor:
-        below, right = (-size % self.patch for size in image.shape[-2:])
-        return F.pad(image, (0, right, 0, below)) if below or right else image
+            distinct = complete(distinct)
+        return Cells(self.embed(as_float(distinct.flatten(1))), index)
 
     @staticmethod
     def grid(height: int, width: int, patch: int) -> tuple[int, int]:

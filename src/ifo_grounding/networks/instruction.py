@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from ifo_grounding import keys
+from ifo_grounding.errors import UserError
 from ifo_grounding.networks.building import (
     Blueprint,
     blueprint,
@@ -29,6 +30,7 @@ from ifo_grounding.networks.fusion import (
     ResidualFiLM,
     SpatialReadout,
 )
+from ifo_grounding.networks.grounding import GroundedTrunk
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.transfer import copy_weights, trunk_of
 from ifo_grounding.networks.trunk import (
@@ -75,7 +77,7 @@ class PairScorer(Network):
         features = config.features
         self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
         self.instruction = instruction_encoder(shapes, config)
-        self.strong = config.preset == "strong"
+        self.strong = config.preset != "paper"
         self.alone = cells_are_alone(config)
         size = self.instruction.size
         if self.strong:
@@ -218,7 +220,12 @@ def begin_with_policy(network: PairScorer, policy: nn.Module, plan: Blueprint) -
         UserError: where the weights do not fit.
     """
     trunk = trunk_of(policy)
-    parts = [
+    if isinstance(trunk, GroundedTrunk):
+        raise UserError(
+            "init_from reads word by word (preset 'grounded'), this network reads sentences: begin "
+            "without it"
+        )
+    parts: list[tuple[nn.Module, nn.Module]] = [
         (trunk.context, network.context),
         (trunk.instruction, network.instruction),
         (trunk.fusion, network.fusion),
@@ -253,7 +260,7 @@ def make_instruction_classifier(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"`` or ``"paper"``.
+        preset: ``"strong"``, ``"grounded"`` or ``"paper"``.
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         out_key: where the logit goes; the paper's threshold of 0.8 is on its sigmoid.
         init_from: a policy of the same preset and sizes whose weights it begins with. It has

@@ -37,7 +37,7 @@ class InverseNetwork(Network):
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__(shapes, config)
-        self.strong = config.preset == "strong"
+        self.strong = config.preset != "paper"
         self.image = image_encoder(shapes, config, images=3 if self.strong else 2)
         self.blocks = nn.Sequential(
             *(ResidualBlock(config.features) for _ in range(config.context))
@@ -87,7 +87,7 @@ def make_inverse(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"`` or ``"paper"``.
+        preset: ``"strong"``, ``"grounded"`` or ``"paper"``.
         in_keys: the image before and the image after, uint8 [*B, C, H, W].
         out_key: where the logits go.
         device: where to build it.

@@ -8,10 +8,11 @@ from torch import nn
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.building import Blueprint
+from ifo_grounding.networks.grounding import GroundedTrunk
 from ifo_grounding.networks.trunk import InstructedNetwork, Trunk
 
 
-def trunk_of(policy: nn.Module) -> Trunk:
+def trunk_of(policy: nn.Module) -> Trunk | GroundedTrunk:
     """Return the trunk of a policy that ``make_policy`` built.
 
     >>> from ifo_grounding.networks import Shapes, make_policy

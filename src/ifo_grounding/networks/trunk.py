@@ -27,6 +27,7 @@ from ifo_grounding.networks.fusion import (
     ResidualFiLM,
     SpatialReadout,
 )
+from ifo_grounding.networks.grounding import GroundedTrunk
 from ifo_grounding.networks.shapes import Shapes
 
 
@@ -122,7 +123,7 @@ def fuse_pairs(fusion: nn.ModuleList, features: Tensor, words: Tensor, pairs: Pa
 
 def cells_are_alone(config: NetworkConfig) -> bool:
     """Whether no cell of a trunk of this configuration sees another."""
-    return config.preset == "strong" and config.kernel == 1 and config.context == 0
+    return config.preset != "paper" and config.kernel == 1 and config.context == 0
 
 
 def image_encoder(shapes: Shapes, config: NetworkConfig, images: int = 1) -> nn.Module:
@@ -218,7 +219,8 @@ class InstructedNetwork(Network):
 
     def __init__(self, shapes: Shapes, config: NetworkConfig, outputs: int) -> None:
         super().__init__(shapes, config)
-        self.trunk = Trunk(shapes, config)
+        by_word = config.matching == "words"
+        self.trunk = GroundedTrunk(shapes, config) if by_word else Trunk(shapes, config)
         self.head = head(self.trunk.size, config, outputs)
 
     def forward(self, pixels: Tensor, instruction: Tensor) -> Tensor:

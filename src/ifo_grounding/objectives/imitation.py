@@ -6,11 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 
 from ifo_grounding import keys
+from ifo_grounding.modules import take_charge
 from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
+
+CONFIDENCE = 4
+"""Power of the likelihood by which words are charged: who is still at sea pays little."""
 
 
 class ImitationLoss(SupervisedLoss):
@@ -19,9 +23,14 @@ class ImitationLoss(SupervisedLoss):
     Writes ``loss_imitation``, ``accuracy`` and ``entropy``. TorchRL's ``BCLoss`` does not fit: it
     takes integer actions for logits.
 
+    Of a network with :class:`~ifo_grounding.networks.WordMaps`, which reads word by word, it also
+    writes ``loss_words``: what its words say about colours and about form is charged for, the more
+    the better the actions are predicted. A word that needs but one of the two then keeps to it.
+
     Args:
         network: a policy with ``get_dist``, as ``make_policy`` builds it.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
+        charge: weight of ``loss_words``.
 
     >>> import torch
     >>> from ifo_grounding.networks import Shapes, make_policy
@@ -44,6 +53,12 @@ class ImitationLoss(SupervisedLoss):
     default_keys: Any = _AcceptedKeys
     out_keys = ["loss_imitation", "accuracy", "entropy"]  # noqa: RUF012
 
+    def __init__(
+        self, network: TensorDictModule, *, reduction: str = "mean", charge: float = 0.02
+    ) -> None:
+        super().__init__(network, reduction=reduction)
+        self.charge = charge
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of a batch of labelled transitions."""
@@ -55,8 +70,14 @@ class ImitationLoss(SupervisedLoss):
         check_action(action, likeliest.shape)
         loss = -dist.log_prob(action)
         right = (likeliest == action).reshape(*loss.shape, -1).all(-1)
+        charged = take_charge(self.network)
+        words = {}
+        if charged is not None:
+            likelihood = (-self._mean(loss, tensordict)).exp()
+            words = {"loss_words": self.charge * likelihood**CONFIDENCE * charged}
         return scalars(
             loss_imitation=self._reduce_loss(loss, tensordict),
+            **words,
             accuracy=self._mean(right, tensordict),
             entropy=self._mean(dist.entropy(), tensordict),
         )

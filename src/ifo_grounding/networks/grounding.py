@@ -1,0 +1,224 @@
+"""Words that each say something about a cell, so that new combinations of them mean something.
+
+An extension of the paper. A network whose instruction is one vector learns each sentence for
+itself: an object that no demonstration goes for is never a target, whatever it is called. Here an
+instruction reaches the policy only through maps of *where*, to which each word adds its own
+evidence about each cell; and walking and stopping see forms and those maps alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks.cells import hidden_from_python, look_up
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.encoders import PatchEncoder, as_float, distinct_patches, patches
+from ifo_grounding.networks.shapes import Shapes
+
+EVIDENCE = 16
+"""Size of what a word is compared with."""
+ROLE, ROLE_NOISE = 4, 0.7
+"""Size of the code from which a word's role is read, and the noise on it in training."""
+USUAL = 0.05
+"""Share by which each batch in training changes what counts as usually said."""
+MANNER = 8
+"""Size of what the instruction says besides places: a side, for example."""
+CONTRAST = 8.0
+"""How sharply an edge is seen: neighbours that differ by 0.1 of the range of a pixel count 0.7."""
+
+
+class Looks(NamedTuple):
+    """What distinct cells look like."""
+
+    colour: Tensor
+    """Which colours are there, wherever, [U, EVIDENCE]."""
+    form: Tensor
+    """Which form is there, whatever its colour, [U, EVIDENCE]."""
+    silhouette: Tensor
+    """The form once more, for what hears no words, [U, features]."""
+    where: Tensor
+    """Which of them lies in each cell, int64 [N, h * w]."""
+
+
+class ColourAndForm(nn.Module):
+    """Sees the colours of a cell and its form apart from one another.
+
+    Colours are what a small network finds at any pixel, form is where neighbouring pixels differ.
+    The first cannot tell a circle from a square, the second red from blue.
+
+    >>> looks = ColourAndForm(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48))
+    >>> looks.colour.shape, looks.silhouette.shape, looks.where.shape
+    (torch.Size([72, 16]), torch.Size([72, 64]), torch.Size([2, 36]))
+    """
+
+    def __init__(self, channels: int, features: int, patch: int) -> None:
+        super().__init__()
+        self.patch = patch
+        half = features // 2
+        self.pixel = nn.Sequential(
+            nn.Linear(channels, half), nn.ReLU(), nn.Linear(half, half), nn.ReLU()
+        )
+        self.colour = nn.Linear(half, EVIDENCE)
+        edges = 2 * patch * (patch - 1)
+        self.outline = nn.Linear(edges, features)
+        self.form = nn.Linear(features, EVIDENCE)
+        self.silhouette = nn.Linear(edges, features)
+
+    def forward(self, image: Tensor) -> Looks:
+        """See an image [N, C, H, W], its distinct cells once."""
+        tiles, where = self.tiles(image)
+        pixels = tiles.transpose(1, 2)  # [U, P * P, C]
+        colour = self.colour(self.pixel(pixels).amax(1))
+        edges = self.edges(tiles)
+        form = self.form(F.relu(self.outline(edges)))
+        size = (EVIDENCE,)
+        return Looks(
+            F.layer_norm(colour, size),
+            F.layer_norm(form, size),
+            F.relu(self.silhouette(edges)),
+            where,
+        )
+
+    def edges(self, tiles: Tensor) -> Tensor:
+        """Say where pixels differ from the next one, whatever their colours: [U, 2 P (P - 1)]."""
+        square = tiles.unflatten(-1, (self.patch, self.patch))
+        across = square.diff(dim=-1).abs().amax(1).flatten(1)
+        down = square.diff(dim=-2).abs().amax(1).flatten(1)
+        return torch.tanh(CONTRAST * torch.cat([across, down], 1))
+
+    def tiles(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Cut [N, C, H, W] into cells [U, C, P * P], and say which lies where [N, h * w]."""
+        found = distinct_patches(image, self.patch)
+        if found is not None:
+            return as_float(found[0]), found[1]
+        every = as_float(patches(image, self.patch))  # [N, h, w, C * P * P]
+        tiles = every.flatten(0, 2).unflatten(-1, (image.shape[1], -1))
+        return tiles, torch.arange(len(tiles), device=image.device).view(len(image), -1)
+
+
+class WordMaps(nn.Module):
+    """Maps of where an instruction points, to which each word adds its evidence.
+
+    A word's evidence about a cell is the sum of what it says of its colours and of its form; how
+    much it counts for a map is its role, read from its place among the other words through a code
+    that is too narrow and noisy to say which colour or form was meant.
+
+    Attributes:
+        charge: what the words of the last batch said in training: for each, the spread over
+            cells of its evidence about colours plus that of its evidence about form. A loss that
+            charges for it makes a word speak about one of the two.
+    """
+
+    usual: Tensor
+    """How much each word usually counts for each map, which tells nothing: [V, maps]."""
+
+    def __init__(self, vocabulary_size: int, maps: int, hidden: int) -> None:
+        super().__init__()
+        self.about_colour = nn.Embedding(vocabulary_size, EVIDENCE)
+        self.about_form = nn.Embedding(vocabulary_size, EVIDENCE)
+        for words in (self.about_colour, self.about_form):
+            nn.init.normal_(words.weight, std=2 / math.sqrt(EVIDENCE))  # maps are sharp early on
+        self.role = nn.Embedding(vocabulary_size, ROLE)
+        self.beside = nn.Conv1d(ROLE, hidden, 5, padding=2)
+        self.relevance = nn.Conv1d(hidden, maps, 5, padding=2)
+        nn.init.normal_(self.relevance.weight, std=1 / math.sqrt(5 * hidden))
+        assert self.relevance.bias is not None
+        nn.init.zeros_(self.relevance.bias)
+        self.manner = nn.Linear(hidden, MANNER)
+        self.register_buffer("usual", torch.zeros(vocabulary_size, maps))
+        self.charge: Tensor | None = None
+
+    def forward(self, looks: Looks, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the maps' logits [N, h * w, maps] and the manner [N, MANNER]."""
+        colour = looks.colour @ self.about_colour.weight.T  # [U, V]
+        form = looks.form @ self.about_form.weight.T
+        weights, manner = self.roles(tokens)
+        if self.training and not hidden_from_python(tokens):
+            said = tokens.unique()
+            said = said[said > 0]
+            self.charge = _spread(colour[:, said]) + _spread(form[:, said])
+        spoken = weights.new_zeros(len(tokens), len(self.role.weight), weights.shape[-1])
+        words = tokens.unsqueeze(-1).expand_as(weights)
+        spoken = spoken.scatter_add(1, words, weights)  # [N, V, maps]
+        if self.training and len(tokens) and not hidden_from_python(tokens):
+            self.usual.lerp_(spoken.detach().float().mean(0), USUAL)
+        spoken = spoken - self.usual.to(spoken.dtype)
+        return look_up(colour + form, looks.where) @ spoken, manner
+
+    def roles(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how much words count for each map [N, L, maps], and the manner [N, MANNER]."""
+        alive = (tokens != 0).unsqueeze(-1)
+        code = torch.tanh(self.role(tokens))
+        if self.training:
+            code = code + ROLE_NOISE * torch.randn_like(code)
+        hidden = F.relu(self.beside((code * alive).movedim(-1, -2)))
+        relevance = len(self.usual[0]) * self.relevance(hidden).movedim(-2, -1).softmax(-1)
+        manner = self.manner((hidden * alive.movedim(-1, -2)).amax(-1))
+        return relevance * alive, manner
+
+
+class GroundedTrunk(nn.Module):
+    """Where an instruction points, where the arm and the like are, and how the two go together.
+
+    Attention maps of two kinds read the image: those of :class:`WordMaps`, which give places and
+    nothing else, and those that see silhouettes and no words, which give places, what is seen
+    there, and how much of each word map lies there.
+    """
+
+    place: Tensor
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
+        super().__init__()
+        channels, height, width = shapes.image_shape
+        patch = config.patch_size or shapes.tile_size or 8
+        self.looks = ColourAndForm(channels, config.features, patch)
+        self.words = WordMaps(shapes.vocabulary_size, config.maps, config.hidden // 2)
+        self.attention = nn.Linear(config.features, config.heads)
+        nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
+        self.value = nn.Linear(config.features, config.values)
+        axes = [
+            torch.linspace(-1, 1, length) if length > 1 else torch.zeros(1)
+            for length in PatchEncoder.grid(height, width, patch)
+        ]
+        place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
+        self.register_buffer("place", place, persistent=False)
+        maps = 2 * config.maps
+        self.size = config.heads * (2 + config.values + maps) + 2 * maps + MANNER
+
+    def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
+        """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
+        self._check(tokens)
+        looks = self.looks(image)
+        logits, manner = self.words(looks, tokens.long())
+        # Evidence for a place or against it: which of the two a map learns is a matter of chance.
+        maps = torch.cat([logits, -logits], -1).softmax(1)  # [N, h * w, 2 * maps]
+        silent = torch.cat([self.attention(looks.silhouette), self.value(looks.silhouette)], -1)
+        silent = look_up(silent, looks.where)
+        heads = self.attention.out_features
+        attention = silent[..., :heads].softmax(1).transpose(1, 2)  # [N, heads, h * w]
+        place = self.place.to(maps.dtype).expand(len(maps), -1, -1)
+        seen = attention @ torch.cat([place, silent[..., heads:], maps], -1)
+        pointed = maps.transpose(1, 2) @ place
+        return torch.cat([seen.flatten(1), pointed.flatten(1), manner], -1)
+
+    def _check(self, tokens: Tensor) -> None:
+        if hidden_from_python(tokens) or not tokens.numel():
+            return
+        lowest, highest = tokens.aminmax()
+        words = self.words.role.num_embeddings
+        if lowest < 0 or highest >= words:
+            raise UserError(
+                f"instructions hold token ids from {int(lowest)} to {int(highest)}, but this "
+                f"network knows 0 to {words - 1}: build it with the vocabulary of the data"
+            )
+
+
+def _spread(evidence: Tensor) -> Tensor:
+    """Return the sum over words of the standard deviation over cells, of [U, V]."""
+    return evidence.var(0, unbiased=False).add(1e-4).sqrt().sum()

@@ -1,0 +1,110 @@
+"""What a policy that reads word by word can and cannot tell apart."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from ifo_grounding.data import labelled_buffer, record_demonstrations
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import episode_endings
+from ifo_grounding.modules import take_charge
+from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
+from ifo_grounding.networks.transfer import trunk_of
+from ifo_grounding.objectives import ImitationLoss
+from ifo_grounding.tasks import VOCABULARY
+from ifo_grounding.training import FitConfig, fit
+from ifo_grounding.world import WorldState, kind, render
+
+
+def tiles(*objects, arm=35):
+    """Draw objects in the first cells of a world, its arm elsewhere: [1, 3, 48, 48]."""
+    state = WorldState.empty(1)
+    state.arm[0] = arm
+    for cell, name in enumerate(objects):
+        state.objects[0, cell] = kind(*name.split())
+    return render(state, 8)
+
+
+def seen(image):
+    torch.manual_seed(0)
+    looks = ColourAndForm(3, 64, 8)(image)
+    return looks.colour[looks.where[0]], looks.form[looks.where[0]]
+
+
+def test_colour_and_form_are_seen_apart():
+    colour, form = seen(tiles("red circle", "red triangle", "blue circle", "yellow triangle"))
+    red_circle, red_triangle, blue_circle, yellow_triangle = range(4)
+    torch.testing.assert_close(colour[red_circle], colour[red_triangle])
+    assert not torch.allclose(colour[red_circle], colour[blue_circle], atol=1e-3)
+    torch.testing.assert_close(form[red_circle], form[blue_circle], atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(form[red_triangle], form[yellow_triangle], atol=1e-3, rtol=1e-3)
+    assert not torch.allclose(form[red_circle], form[red_triangle], atol=1e-2)
+
+
+def test_each_word_adds_evidence_of_its_own(shapes):
+    trunk = trunk_of(make_policy(shapes, "grounded", seed=0))
+    assert isinstance(trunk, GroundedTrunk)
+    words = trunk.words
+    with torch.no_grad():
+        words.relevance.weight.zero_()  # every word counts alike for every map
+        looks = trunk.looks(tiles("red circle", "blue triangle"))
+        both, red, circle = (
+            words(looks, VOCABULARY.encode([text]))[0] for text in ("red circle", "red", "circle")
+        )
+    torch.testing.assert_close(both, red + circle)
+
+
+def test_roles_are_noisy_in_training_alone(shapes):
+    policy = make_policy(shapes, "grounded", seed=0)
+    words = trunk_of(policy).words
+    tokens = VOCABULARY.encode(["move to the red circle"])
+    assert torch.equal(words.roles(tokens)[0], words.roles(tokens)[0])
+    words.train()
+    assert not torch.equal(words.roles(tokens)[0], words.roles(tokens)[0])
+
+
+def test_what_words_say_is_charged_for_in_training(shapes):
+    policy = make_policy(shapes, "grounded", seed=0)
+    batch = TensorDict(
+        {
+            "pixels": tiles("red circle", "blue triangle"),
+            "instruction": VOCABULARY.encode(["move to the red circle"]),
+            "action": torch.tensor([5]),
+        },
+        [1],
+    )
+    loss = ImitationLoss(policy, charge=1.0)
+    charged = loss(batch)["loss_words"]
+    charged.backward()
+    words = trunk_of(policy).words
+    said = words.about_form.weight.grad.abs().sum(1) > 0
+    assert said.nonzero().squeeze(1).tolist() == sorted(
+        batch["instruction"][batch["instruction"] > 0].tolist()
+    )
+    assert take_charge(policy) is None  # taken, so that the policy can be copied
+    assert "loss_words" not in loss.eval()(batch)
+    assert "loss_words" not in ImitationLoss(make_policy(shapes, seed=0))(batch)
+
+
+def test_words_outside_the_vocabulary_are_named(shapes):
+    policy = make_policy(shapes, "grounded", seed=0)
+    with pytest.raises(UserError, match="token ids from 1 to 99"):
+        policy(pixels=tiles("red circle"), instruction=torch.tensor([[1, 99]]))
+
+
+@pytest.mark.slow
+def test_pairs_that_no_demonstration_names_are_followed():
+    holdout = {"split": "train", "holdout": "validation-3"}
+    demos, truth = record_demonstrations("move", 3000, seed=0, keep_truth=True, **holdout)
+    buffer = labelled_buffer(demos, truth.actions)
+    config = FitConfig(steps=800, batch_size=256, lr=4e-3, weight_decay=0.01)
+
+    def begin(seed):
+        loss = ImitationLoss(make_policy(demos, "grounded", seed=seed))
+        return loss, fit(loss, buffer, config, seed=0, until=300)[-1]["loss_imitation"]
+
+    loss, _ = min((begin(seed) for seed in range(6)), key=lambda tried: tried[1])
+    fit(loss, buffer, config, seed=0)
+    scenes = {"episodes": 1000, "stream": "validation", "holdout": "validation-3"}
+    found = episode_endings(loss.network, "move", split="zero-shot", **scenes)
+    assert found.counts["success"] > 800
