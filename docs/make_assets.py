@@ -1,18 +1,21 @@
 """Draw the pictures of the README: ``python docs/make_assets.py RUN`` after a demo run.
 
-``world.png`` shows a scene of each task; ``agent.gif`` a policy of that run (a name or a path).
+``world.png`` shows a scene of each task; ``agent.gif`` a policy of that run (a name or a path). One
+of the preset `grounded` gives ``evidence.png`` instead: what its words say about things.
 """
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from ifo_grounding import networks
-from ifo_grounding.evaluation import record_episodes
+from ifo_grounding.evaluation import record_episodes, word_evidence
 from ifo_grounding.files import atomic_write, read_json
-from ifo_grounding.report import Case, animation, gallery
+from ifo_grounding.report import Case, animation, evidence_figure, figure_png, gallery
 from ifo_grounding.tasks import TASKS, VOCABULARY, SceneOptions, SceneStream
+from ifo_grounding.tasks.grammar import HOLDOUTS
 from ifo_grounding.training import Run
 from ifo_grounding.world import render
 
@@ -38,10 +41,21 @@ def agent(run: Run) -> bytes:
     return animation(shown, columns=len(SCENES), width=180)
 
 
+def evidence(run: Run, options: dict[str, Any]) -> bytes:
+    policy = networks.load(run.need("policy-phase1.safetensors", "two_phase"))
+    held_out = HOLDOUTS[options["world"]["holdout"]] if options["world"]["split"] == "train" else ()
+    return figure_png(evidence_figure(word_evidence(policy), held_out))
+
+
 def main() -> None:
     if len(sys.argv) != 2:
         raise SystemExit("usage: python docs/make_assets.py RUN")
-    pictures = {"world.png": world(), "agent.gif": agent(Run(sys.argv[1]))}
+    run = Run(sys.argv[1])
+    options = read_json(run.need("options.json", "two_phase"))
+    if options["network"] == "grounded":
+        pictures = {"evidence.png": evidence(run, options)}
+    else:
+        pictures = {"world.png": world(), "agent.gif": agent(run)}
     for name, content in pictures.items():
         with atomic_write(ASSETS / name) as temporary:
             temporary.write_bytes(content)

@@ -9,6 +9,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import episode_endings
 from ifo_grounding.modules import take_charge
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
+from ifo_grounding.networks.grounding import swap_words
 from ifo_grounding.networks.transfer import trunk_of
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
@@ -54,13 +55,34 @@ def test_each_word_adds_evidence_of_its_own(shapes):
     torch.testing.assert_close(both, red + circle)
 
 
-def test_roles_are_noisy_in_training_alone(shapes):
-    policy = make_policy(shapes, "grounded", seed=0)
-    words = trunk_of(policy).words
-    tokens = VOCABULARY.encode(["move to the red circle"])
-    assert torch.equal(words.roles(tokens)[0], words.roles(tokens)[0])
+def test_roles_do_not_hear_every_word_in_training(shapes):
+    words = trunk_of(make_policy(shapes, "grounded", seed=0)).words
+    tokens = VOCABULARY.encode(["move to the red circle", "move to the blue diamond"])
+    heard = [part.clone() for part in words.roles(tokens)]
+    again = words.roles(tokens)
+    assert all(map(torch.equal, heard, again))
     words.train()
-    assert not torch.equal(words.roles(tokens)[0], words.roles(tokens)[0])
+    torch.manual_seed(0)
+    differing = [
+        [not torch.equal(*parts) for parts in zip(heard, words.roles(tokens), strict=True)]
+        for _ in range(10)
+    ]
+    assert all(map(any, zip(*differing, strict=True)))  # relevance and manner
+
+
+def test_words_are_swapped_between_instructions_of_a_length():
+    tokens = torch.tensor(
+        [[1, 2, 3, 4], [5, 6, 7, 8], [9, 10, 0, 0], [11, 12, 0, 0], [13, 0, 0, 0]]
+    )
+    swapped = swap_words(tokens, 1.0)
+    assert swapped.equal(tokens[[1, 0, 3, 2, 4]])
+    torch.manual_seed(0)
+    many = tokens[:2].repeat(500, 1)
+    some = swap_words(many, 0.5)
+    assert ((some == tokens[0]) | (some == tokens[1])).all()
+    assert 0.15 < (some != many).float().mean() < 0.35  # half of the others are the same
+    assert swap_words(tokens, 0.0).equal(tokens)
+    assert swap_words(tokens[:0], 1.0).shape == (0, 4)
 
 
 def test_what_words_say_is_charged_for_in_training(shapes):

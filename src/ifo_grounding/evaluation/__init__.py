@@ -18,6 +18,7 @@ from ifo_grounding.evaluation.suitability import (
     judged_choices,
     suitable_rate,
 )
+from ifo_grounding.evaluation.words import WordEvidence, word_evidence
 from ifo_grounding.modules import evaluating
 from ifo_grounding.stats import (
     Difference,
@@ -42,6 +43,7 @@ __all__ = [
     "RewardAudit",
     "SuccessResult",
     "SuitabilityResult",
+    "WordEvidence",
     "auc",
     "compare_endings",
     "compare_success",
@@ -59,4 +61,5 @@ __all__ = [
     "suitable_rate",
     "two_level_bootstrap",
     "wilson",
+    "word_evidence",
 ]

@@ -23,8 +23,10 @@ from ifo_grounding.networks.shapes import Shapes
 
 EVIDENCE = 16
 """Size of what a word is compared with."""
-ROLE, ROLE_NOISE = 4, 0.7
-"""Size of the code from which a word's role is read, and the noise on it in training."""
+ROLE, SWAPPED = 8, 0.8
+"""Size of the code from which a word's role is read, and the share of words that are swapped."""
+SIDE, SIDE_NOISE = 4, 0.7
+"""Size of the code from which the manner is read, and the noise on it in training."""
 USUAL = 0.05
 """Share by which each batch in training changes what counts as usually said."""
 MANNER = 8
@@ -106,8 +108,9 @@ class WordMaps(nn.Module):
     """Maps of where an instruction points, to which each word adds its evidence.
 
     A word's evidence about a cell is the sum of what it says of its colours and of its form; how
-    much it counts for a map is its role, read from its place among the other words through a code
-    that is too narrow and noisy to say which colour or form was meant.
+    much it counts for a map is its role, read from its place among the other words. In training,
+    roles are read from instructions whose words were swapped (:func:`swap_words`), so that they
+    cannot depend on which colour or form is meant.
 
     Attributes:
         charge: what the words of the last batch said in training: for each, the spread over
@@ -130,6 +133,8 @@ class WordMaps(nn.Module):
         nn.init.normal_(self.relevance.weight, std=1 / math.sqrt(5 * hidden))
         assert self.relevance.bias is not None
         nn.init.zeros_(self.relevance.bias)
+        self.side = nn.Embedding(vocabulary_size, SIDE)
+        self.around = nn.Conv1d(SIDE, hidden, 5, padding=2)
         self.manner = nn.Linear(hidden, MANNER)
         self.register_buffer("usual", torch.zeros(vocabulary_size, maps))
         self.charge: Tensor | None = None
@@ -154,13 +159,39 @@ class WordMaps(nn.Module):
     def roles(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much words count for each map [N, L, maps], and the manner [N, MANNER]."""
         alive = (tokens != 0).unsqueeze(-1)
-        code = torch.tanh(self.role(tokens))
+        heard = swap_words(tokens, SWAPPED) if self.training else tokens
+        code = torch.tanh(self.role(heard)) * alive
+        beside = F.relu(self.beside(code.movedim(-1, -2)))
+        relevance = self.relevance(beside).movedim(-2, -1).softmax(-1)
+        side = torch.tanh(self.side(tokens))
         if self.training:
-            code = code + ROLE_NOISE * torch.randn_like(code)
-        hidden = F.relu(self.beside((code * alive).movedim(-1, -2)))
-        relevance = len(self.usual[0]) * self.relevance(hidden).movedim(-2, -1).softmax(-1)
-        manner = self.manner((hidden * alive.movedim(-1, -2)).amax(-1))
-        return relevance * alive, manner
+            side = side + SIDE_NOISE * torch.randn_like(side)
+        around = F.relu(self.around((side * alive).movedim(-1, -2)))
+        manner = self.manner((around * alive.movedim(-1, -2)).amax(-1))
+        return len(self.usual[0]) * relevance * alive, manner
+
+
+def swap_words(tokens: Tensor, share: float) -> Tensor:
+    """Swap words for those at the same place of another instruction of the batch, as long.
+
+    Args:
+        tokens: int64 [N, L].
+        share: of the words that are swapped.
+
+    >>> tokens = torch.tensor([[1, 2, 3, 0], [1, 5, 6, 0], [7, 0, 0, 0]])
+    >>> swap_words(tokens, 1.0).tolist()
+    [[1, 5, 6, 0], [1, 2, 3, 0], [7, 0, 0, 0]]
+    """
+    lengths = (tokens != 0).sum(1)
+    order = (lengths + torch.rand(lengths.shape, device=tokens.device)).argsort()
+    other = torch.empty_like(order)
+    other[order] = order.roll(1)
+    # The first of each length has a longer or shorter one before it: the last of its own is its.
+    first = lengths[order] != lengths[order.roll(1)]
+    last = lengths[order] != lengths[order.roll(-1)]
+    other[order[first]] = order[last]
+    swapped = torch.rand(tokens.shape, device=tokens.device) < share
+    return torch.where(swapped, tokens[other], tokens)
 
 
 class GroundedTrunk(nn.Module):

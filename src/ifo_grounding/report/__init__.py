@@ -9,6 +9,7 @@ from ifo_grounding.report.casestudy import (
     improved_episodes,
     instruction_cases,
 )
+from ifo_grounding.report.evidence import evidence_figure
 from ifo_grounding.report.metrics import read_metrics
 from ifo_grounding.report.page import write_report
 from ifo_grounding.report.plots import (
@@ -31,6 +32,7 @@ __all__ = [
     "changed_scenes",
     "compared_rates",
     "confusion",
+    "evidence_figure",
     "figure_png",
     "format_cell",
     "gallery",
