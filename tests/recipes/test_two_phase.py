@@ -16,6 +16,7 @@ PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
     [
         ("move", "strong", []),
         ("pick-udlr", "paper", ["self_examine.pairs=24"]),
+        ("move-udlr", "grounded", ["world.split=train", "evaluate.split=zero-shot"]),
         ("pick-out", "strong", ["self_examine.kind=both", "self_examine.reward_steps=1"]),
     ],
 )
@@ -32,6 +33,7 @@ def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, pre
     assert results["phase1"]["scenes"] == results["phase2"]["scenes"]
     assert results["phase1"]["rate"]["count"] == 50
     assert results["gain"]["count"] == 50
+    assert ("trained" in results) == (options.evaluate.split == "zero-shot")
     assert 0 < results["labels"]["rate"]["rate"] <= 1
     table = results_table(results)
     assert "phase 2 - phase 1" in table

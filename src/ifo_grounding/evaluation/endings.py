@@ -67,11 +67,11 @@ class Endings:
         return dict(zip(SHARED, found.tolist(), strict=True))
 
     @property
-    def by_object(self) -> dict[str, tuple[int, int]]:
+    def by_object(self) -> dict[str, list[int]]:
         """Successes and episodes by the object that the instruction is about."""
         rows = ((kind_name(int(number)), self.wanted == number) for number in self.wanted.unique())
         return {
-            name: (int((self.kind[asked] == SUCCESS).sum()), int(asked.sum()))
+            name: [int((self.kind[asked] == SUCCESS).sum()), int(asked.sum())]
             for name, asked in rows
         }
 
