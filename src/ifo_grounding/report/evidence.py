@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
@@ -17,6 +18,8 @@ AGAINST, FOR = "#B5532A", PALETTE[0]
 def evidence_figure(said: WordEvidence, held_out: Sequence[str] = ()) -> Figure:
     """Draw what words say of the colours and of the forms of objects, for and against.
 
+    Each word's evidence is shown as a share of the most that it says about anything.
+
     Args:
         said: from :func:`~ifo_grounding.evaluation.word_evidence`.
         held_out: objects that no instruction of the demonstrations mentions, which are marked.
@@ -28,21 +31,21 @@ def evidence_figure(said: WordEvidence, held_out: Sequence[str] = ()) -> Figure:
     >>> [label.get_text() for label in axes[0].get_yticklabels()]
     ['red circle', 'blue circle *']
     """
-    panels = {"of its colours": said.colour, "of its form": said.form}
-    most = max(float(values.abs().max()) for values in panels.values()) or 1.0
+    most = torch.cat([said.colour, said.form]).abs().amax(0).clamp_min(1e-9)
+    panels = {"of colours": said.colour / most, "of form": said.form / most}
     colours = LinearSegmentedColormap.from_list("evidence", [AGAINST, "#F7F7F4", FOR])
     height = 1.3 + 0.27 * len(said.objects)
     figure, grid = _figure(2.6 + 0.95 * len(said.words), height, columns=2)
     for axes, (title, values) in zip(grid[0], panels.items(), strict=True):
-        _dress(axes, f"What a word says {title}", grid="")
-        axes.imshow(values.numpy(), cmap=colours, vmin=-most, vmax=most, aspect="auto")
+        _dress(axes, f"What words say {title}", grid="")
+        axes.imshow(values.numpy(), cmap=colours, vmin=-1, vmax=1, aspect="auto")
         axes.set_xticks(range(len(said.words)), said.words, rotation=40, ha="right")
         names = [f"{name} *" if name in held_out else name for name in said.objects]
         axes.set_yticks(range(len(names)), names if axes is grid[0][0] else [""] * len(names))
         for row in range(len(said.objects)):
             for column in range(len(said.words)):
                 value = float(values[row, column])
-                strong = abs(value) > 0.6 * most
+                strong = abs(value) > 0.6
                 axes.text(
                     column,
                     row,
