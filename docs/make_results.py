@@ -8,7 +8,6 @@ import functools
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from ifo_grounding.files import atomic_write, read_json
@@ -19,8 +18,10 @@ from ifo_grounding.report import (
     results_rows,
     save_figure,
 )
-from ifo_grounding.report.results import restored
-from ifo_grounding.stats import Difference, Rate, holm, paired_difference, two_level_bootstrap
+from ifo_grounding.report.results import brief, restored
+from ifo_grounding.report.results import unpacked as outcomes
+from ifo_grounding.report.tables import renewed
+from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap
 from ifo_grounding.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
@@ -32,7 +33,6 @@ NAMES = {
     "cloned": "accepted rollouts cloned",
     "phase2": "phase 2",
 }
-MARKS = ("<!-- results -->", "<!-- /results -->")
 
 Key = tuple[str, int, str]
 """Of a study: task, demonstrations, preset and variant."""
@@ -55,16 +55,6 @@ def studies() -> dict[Key, list[dict[str, Any]]]:
         key = (options["task"], options["demonstrations"]["n"], kind)
         found.setdefault(key, []).append(run)
     return dict(sorted(found.items(), key=lambda item: (TASKS.index(item[0][0]), item[0][1:])))
-
-
-def outcomes(runs: list[dict[str, Any]], name: str) -> np.ndarray:
-    """Return the success of a policy on every scene, bool [seeds, scenes]."""
-    rows = []
-    for run in runs:
-        result = run["results"][name]
-        bits = np.unpackbits(np.frombuffer(bytes.fromhex(result["outcomes"]), np.uint8))
-        rows.append(bits[: result["rate"]["count"]].astype(bool))
-    return np.stack(rows)
 
 
 def study_section() -> list[str]:
@@ -256,10 +246,6 @@ def hacking_picture() -> Figure | None:
     return audit_figure(read_json(HACKED)["audit"]) if HACKED.exists() else None
 
 
-def brief(value: Rate | Difference) -> str:
-    return str(value).rpartition(" (")[0].replace(" points", "")
-
-
 def page(found: list[dict[str, Any]]) -> str:
     """Return the page of results."""
     parts = [
@@ -283,13 +269,10 @@ def page(found: list[dict[str, Any]]) -> str:
 
 def readme(text: str) -> str:
     """Return the README with its table of results renewed."""
-    before, _, rest = text.partition(MARKS[0])
-    _, _, after = rest.partition(MARKS[1])
     shown = ("task", "demonstrations", "seeds", "phase 1", "phase 2")
     against = ("over continued", "over cloned")
     rows = [{name: row[name] for name in (*shown, *against)} for row in study_rows()]
-    table = markdown_table(rows)
-    return f"{before}{MARKS[0]}\n{table}\n{MARKS[1]}{after}"
+    return renewed(text, "results", f"\n{markdown_table(rows)}\n")
 
 
 def written() -> dict[Path, str]:

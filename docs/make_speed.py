@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from ifo_grounding.files import atomic_write, read_json
 from ifo_grounding.report import markdown_table, save_figure
+from ifo_grounding.report.tables import renewed
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "speed.md"
@@ -22,7 +23,6 @@ ORDER = (
     "growth",
 )
 """Of the rows in the table; others come last."""
-MARKS = ("<!-- speed -->", "<!-- /speed -->")
 
 
 def measured(device: str = "cpu") -> dict[str, dict[str, Any]]:
@@ -121,9 +121,7 @@ def growth() -> Figure | None:
 
 def written() -> dict[Path, str]:
     """Return what the page should say."""
-    before, _, rest = PAGE.read_text().partition(MARKS[0])
-    _, _, after = rest.partition(MARKS[1])
-    return {PAGE: f"{before}{MARKS[0]}\n{section()}\n{MARKS[1]}{after}"}
+    return {PAGE: renewed(PAGE.read_text(), "speed", f"\n{section()}\n")}
 
 
 def main() -> None:

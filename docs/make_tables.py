@@ -9,13 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ifo_grounding.evaluation.endings import ENDINGS
 from ifo_grounding.files import atomic_write, read_json
 from ifo_grounding.report import markdown_table
-from ifo_grounding.report.results import restored
+from ifo_grounding.report.results import brief, restored
+from ifo_grounding.report.results import unpacked as outcomes
+from ifo_grounding.report.tables import renewed
 from ifo_grounding.stats import Rate, paired_difference, two_level_bootstrap, wilson
 from ifo_grounding.tasks import TASKS
+from ifo_grounding.tasks.goals import REASONS
 from ifo_grounding.tasks.grammar import HOLDOUTS
 
 ROOT = Path(__file__).parents[1]
@@ -35,8 +37,7 @@ TABLE_3 = dict(zip(TASKS, (91.725, 81.145, 90.190, 77.940, 76.810), strict=True)
 TABLE_4 = dict(
     zip(TASKS, ((62.8, 68.4), (56.8, 60.6), (11.2, 14.6), (27.4, 29.8), (19.8, 21.0)), strict=True)
 )
-ERRORS = ("missing", "ambiguous", "out of bounds", "occupied", "already true", "unachievable")
-FAILURES = ("stuck", "wrong object", "wrong place", "nothing done")
+ERRORS, FAILURES = REASONS[1:], ENDINGS[1:]
 NOT_RUN = "not run"
 
 Pieces = dict[tuple[str, str, str], list[dict[str, Any]]]
@@ -50,16 +51,6 @@ def pieces() -> Pieces:
         options = run["options"]
         found.setdefault((options["task"], options["network"], options["variant"]), []).append(run)
     return found
-
-
-def outcomes(runs: list[dict[str, Any]], name: str) -> np.ndarray:
-    """Return the success of a policy on every scene, bool [seeds, scenes]."""
-    rows = []
-    for run in runs:
-        result = run["results"][name]
-        bits = np.unpackbits(np.frombuffer(bytes.fromhex(result["outcomes"]), np.uint8))
-        rows.append(bits[: result["rate"]["count"]].astype(bool))
-    return np.stack(rows)
 
 
 def success(runs: list[dict[str, Any]] | None, name: str) -> str:
@@ -192,10 +183,6 @@ def commands(found: Pieces) -> str:
     return "\n".join(['??? note "Commands"', "", *(f"    {line}" for line in made)]) if made else ""
 
 
-def brief(value: Any) -> str:
-    return str(value).rpartition(" (")[0].replace(" points", "")
-
-
 def zero_shot_content() -> str:
     """Return the part of the page on zero-shot that the results decide."""
     found = pieces()
@@ -249,15 +236,10 @@ def zero_shot_row(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
 def written() -> dict[Path, str]:
     """Return what each page should say."""
     parts = {PAGE: ("tables", content()), ZERO_SHOT: ("zero-shot", zero_shot_content())}
-    return {path: between(path.read_text(), *part) for path, part in parts.items()}
-
-
-def between(text: str, mark: str, renewed: str) -> str:
-    """Return a page with the part between two marks renewed."""
-    first, last = f"<!-- {mark} -->", f"<!-- /{mark} -->"
-    before, _, rest = text.partition(first)
-    _, _, after = rest.partition(last)
-    return f"{before}{first}\n\n{renewed}\n\n{last}{after}"
+    return {
+        path: renewed(path.read_text(), mark, f"\n\n{part}\n\n")
+        for path, (mark, part) in parts.items()
+    }
 
 
 def main() -> None:

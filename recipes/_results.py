@@ -1,9 +1,8 @@
 """Small files of what was measured; apart from `_shared`, for reports are slow to import."""
 
 import sys
-from pathlib import Path
 
-from _shared import open_run, plain
+from _shared import open_run, plain, result_file
 from omegaconf import DictConfig
 
 from ifo_grounding.files import write_json
@@ -30,6 +29,5 @@ def write_result(options: DictConfig, results: dict, command: str) -> dict:
 def keep_result(options: DictConfig, content: dict) -> None:
     """Write what was measured into the folder of results, where one is named."""
     if options.results:
-        parts = [options.task, options.demonstrations.n, options.network, options.variant]
-        name = "-".join(str(part) for part in parts if part)
-        write_json(Path(options.results) / f"{name}-seed{options.seed}.json", content)
+        of = (options.task, options.demonstrations.n, options.network, options.variant)
+        write_json(result_file(options.results, *of, options.seed), content)

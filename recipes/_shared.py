@@ -90,6 +90,15 @@ def load_network(run: Run, name: str, recipe: str, options: DictConfig) -> Any:
     return networks.load(run.need(name, recipe), device=options.device)
 
 
+def result_file(
+    folder: str, task: str, demonstrations: int, network: str, variant: str | None, seed: int
+) -> Path:
+    """Return the small file of what was measured of one run."""
+    parts = [task, demonstrations, network, variant]
+    name = "-".join(str(part) for part in parts if part)
+    return Path(folder) / f"{name}-seed{seed}.json"
+
+
 def starting_policy(run: Run, options: DictConfig, section: str) -> Any:
     """Return the phase-1 policy where a judge is to begin with its weights, else None."""
     begins = options[section].init_from_policy

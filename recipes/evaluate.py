@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 import torch
 from _results import keep_result, write_result
 from _shared import (
@@ -17,7 +16,6 @@ from _shared import (
     world,
 )
 from omegaconf import DictConfig
-from torch import Tensor
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import record_demonstrations
@@ -32,6 +30,7 @@ from ifo_grounding.evaluation import (
     suitable_rate,
 )
 from ifo_grounding.report import results_table
+from ifo_grounding.report.results import packed
 from ifo_grounding.training import Run
 from ifo_grounding.transforms import LearnedReward
 
@@ -51,29 +50,26 @@ def evaluate(options: DictConfig) -> dict:
     run.need(POLICIES[0], "imitate")
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
     results: dict[str, Any] = {"labels": run.record("label")["result"]["accuracy"]}
-    results |= evaluate_policies(run, options)
-    results |= evaluate_endings(run, options)
+    policies = {
+        name: load_network(run, file, "imitate", options)
+        for name, file in NAMES.items()
+        if (run / file).exists()
+    }
+    results |= evaluate_policies(policies, run, options)
+    results |= evaluate_endings(policies, options)
     if options.evaluate.states and (run / CLASSIFIER).exists():
         results["suitability"] = evaluate_choices(run, options)
-    results |= evaluate_judges(run, options)
+    results |= evaluate_judges(policies["phase1"], run, options)
     return stage.finish(results)
 
 
-def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
-    """Measure success of the policy of each phase on the same fixed scenes, and the difference."""
+def evaluate_policies(policies: dict[str, Any], run: Run, options: DictConfig) -> dict[str, Any]:
+    """Measure success of each policy on the same fixed scenes, and the gain of phase 2."""
     section = options.evaluate
+    shown = evaluation_scenes(options, section.episodes)
     measured = {
-        name: success_rate(
-            load_network(run, file, "imitate", options),
-            options.task,
-            mode=section.mode,
-            episodes=section.episodes,
-            seed=section.seed,
-            stream=section.stream,
-            **evaluation_world(options),
-        )
-        for name, file in NAMES.items()
-        if (run / file).exists()
+        name: success_rate(policy, options.task, mode=section.mode, **shown)
+        for name, policy in policies.items()
     }
     results = {
         name: {**success.as_dict(), "outcomes": packed(success.outcomes)}
@@ -86,41 +82,25 @@ def evaluate_policies(run: Run, options: DictConfig) -> dict[str, Any]:
     return results
 
 
-def evaluate_endings(run: Run, options: DictConfig) -> dict[str, Any]:
+def evaluate_endings(policies: dict[str, Any], options: DictConfig) -> dict[str, Any]:
     """Say how the greedy episodes of each phase end, and what phase 2 changes.
 
     Of a zero-shot evaluation, the same of instructions that name trained pairs alone.
     """
-    found = endings(run, options, options.evaluate.split)
+    shown = evaluation_scenes(options, options.evaluate.episodes)
+    phases = {name: policies[name] for name in ("phase1", "phase2") if name in policies}
+
+    def endings(**scenes: Any) -> dict[str, Endings]:
+        return {n: episode_endings(p, options.task, **scenes) for n, p in phases.items()}
+
+    found = endings(**shown)
     results: dict[str, Any] = {"endings": {name: end.as_dict() for name, end in found.items()}}
     if len(found) > 1:
         results["changes"] = compare_endings(*found.values())
-    if options.evaluate.split == "zero-shot":
-        trained = endings(run, options, "train")
+    if shown["split"] == "zero-shot":
+        trained = endings(**{**shown, "split": "train"})
         results["trained"] = {name: end.as_dict() for name, end in trained.items()}
     return results
-
-
-def endings(run: Run, options: DictConfig, split: str) -> dict[str, Endings]:
-    """Play the scenes of a split with the policy of each phase."""
-    section = options.evaluate
-    return {
-        phase: episode_endings(
-            load_network(run, file, "imitate", options),
-            options.task,
-            episodes=section.episodes,
-            seed=section.seed,
-            stream=section.stream,
-            **{**world(options), "split": split},
-        )
-        for phase, file in zip(("phase1", "phase2"), POLICIES, strict=True)
-        if (run / file).exists()
-    }
-
-
-def packed(outcomes: Tensor) -> str:
-    """Return the success of each scene as hexadecimal digits, four scenes each."""
-    return np.packbits(outcomes.numpy()).tobytes().hex()
 
 
 def evaluate_choices(run: Run, options: DictConfig) -> dict[str, Any]:
@@ -141,17 +121,11 @@ def evaluate_choices(run: Run, options: DictConfig) -> dict[str, Any]:
     return result.as_dict()
 
 
-def evaluate_judges(run: Run, options: DictConfig) -> dict[str, Any]:
+def evaluate_judges(policy: Any, run: Run, options: DictConfig) -> dict[str, Any]:
     """Compare the judges with the expert's actions and with the true success of rollouts."""
     results: dict[str, Any] = {}
-    policy = load_network(run, POLICIES[0], "imitate", options)
     shown = evaluation_world(options)
-    audited = {
-        "episodes": options.evaluate.audit_episodes,
-        "seed": options.evaluate.seed,
-        "stream": options.evaluate.stream,
-        **shown,
-    }
+    audited = evaluation_scenes(options, options.evaluate.audit_episodes)
     if (run / REWARD).exists():
         judge = load_network(run, REWARD, "train_reward", options)
         demos, truth = record_demonstrations(
@@ -172,6 +146,13 @@ def evaluate_judges(run: Run, options: DictConfig) -> dict[str, Any]:
 def evaluation_world(options: DictConfig) -> dict[str, Any]:
     """Return the world's arguments with the split to evaluate on."""
     return {**world(options), "split": options.evaluate.split}
+
+
+def evaluation_scenes(options: DictConfig, episodes: int) -> dict[str, Any]:
+    """Return which scenes to play, as the functions of `evaluation` take them."""
+    section = options.evaluate
+    chosen = {"episodes": episodes, "seed": section.seed, "stream": section.stream}
+    return {**chosen, **evaluation_world(options)}
 
 
 @recipe_main

@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from _shared import plain
+from _shared import plain, result_file
 from omegaconf import DictConfig
 from tqdm import tqdm
 
@@ -109,8 +109,8 @@ def chain(
             **flat(sections.phase[phase]),
         }
         arguments = tuple(f"{name}={value}" for name, value in given.items())
-        file = Path(options.results) / f"{task}-{options.demonstrations}-{preset}-{phase}"
-        yield Piece(names[phase], arguments, Path(f"{file}-seed{seed}.json"))
+        of = (task, options.demonstrations, preset, phase, seed)
+        yield Piece(names[phase], arguments, result_file(options.results, *of))
 
 
 def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any]:
@@ -125,14 +125,13 @@ def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any
 def reproduce(options: DictConfig) -> list[Piece]:
     """Make what is missing, chains side by side; return what could not be made."""
     chains = pieces(options)
-    total = sum(map(len, chains))
     if options.list:
         for piece in (piece for chain in chains for piece in chain):
             print("done   " if piece.done else "not run", piece.file)
         return []
     failed: list[Piece] = []
     with (
-        tqdm(total=total, unit="piece", disable=not options.progress) as bar,
+        tqdm(total=sum(map(len, chains)), unit="piece", disable=not options.progress) as bar,
         ThreadPoolExecutor(options.jobs) as pool,
     ):
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -17,14 +18,11 @@ from ifo_grounding.evaluation.episodes import (
     MAX_STEPS,
     Outcomes,
     Policy,
-    SceneHash,
     device_of,
     play,
+    play_scenes,
     scene_batches,
-    seeded,
 )
-from ifo_grounding.modules import evaluating
-from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.goals import SIDES, Goal, Plan
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.world import SHAPES, WorldState, kind_name, neighbour
@@ -113,15 +111,14 @@ def episode_endings(
     """
     options = {"batch_size": batch_size, "max_steps": max_steps, **env_options}
     options["device"] = torch.device(device) if device is not None else device_of(policy)
-    scenes, parts = SceneHash(), []
     batches = scene_batches(task, range(episodes), seed=seed, stream=stream, **options)
-    for number, (env, start, count) in enumerate(batches):
+
+    def play_batch(env: EnvBase, start: TensorDictBase) -> Iterator[Tensor]:
         assert isinstance(env, PickAndPlaceEnv)
-        scenes.update(start, count)
-        with evaluating(policy), seeded(derive(seed, "success", mode, number), options["device"]):
-            parts.append([column[:count].cpu() for column in _play(policy, env, start, mode)])
-    kind, wanted, mistaken, actions = (torch.cat(column) for column in zip(*parts, strict=True))
-    return Endings(kind, wanted, mistaken, actions, scenes.hexdigest())
+        return _play(policy, env, start, mode)
+
+    (kind, wanted, mistaken, actions), scenes = play_scenes(policy, batches, seed, mode, play_batch)
+    return Endings(kind, wanted, mistaken, actions, scenes)
 
 
 def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -180,6 +180,34 @@ def scene_batches(
         padded = torch.cat([chosen, chosen[:1].expand(rows - len(chosen))])
         scene = TensorDict({keys.SCENE: padded.unsqueeze(-1)}, batch_size=[rows], device=device)
         yield env, env.reset(scene), len(chosen)
+
+
+def play_scenes(
+    policy: Policy,
+    batches: Iterable[tuple[EnvBase, TensorDictBase, int]],
+    seed: int,
+    mode: str,
+    play_batch: Callable[[EnvBase, TensorDictBase], Iterable[Tensor]],
+) -> tuple[list[Tensor], str]:
+    """Play batch after batch in eval mode, each with its own seed.
+
+    Args:
+        policy: which plays.
+        batches: from :func:`scene_batches`.
+        seed: of the actions, where sampled.
+        mode: ``greedy`` or ``sampled``.
+        play_batch: plays an environment from what its reset returned; tensors of its rows [B, ...].
+
+    Returns:
+        What ``play_batch`` returned, of all scenes [N, ...] on the CPU, and the scenes' hash.
+    """
+    scenes, parts = SceneHash(), []
+    for number, (env, start, count) in enumerate(batches):
+        scenes.update(start, count)
+        device = start[keys.PIXELS].device
+        with modules.evaluating(policy), seeded(derive(seed, "success", mode, number), device):
+            parts.append([column[:count].cpu() for column in play_batch(env, start)])
+    return [torch.cat(column) for column in zip(*parts, strict=True)], scenes.hexdigest()
 
 
 def _batches_of(

@@ -11,20 +11,17 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ifo_grounding import keys
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.evaluation.episodes import (
     MAX_STEPS,
     MODES,
+    Outcomes,
     Policy,
-    SceneHash,
     device_of,
     play,
+    play_scenes,
     scene_batches,
-    seeded,
 )
-from ifo_grounding.modules import evaluating
-from ifo_grounding.seeding import derive
 from ifo_grounding.stats import Difference, Rate, paired_difference, wilson
 
 
@@ -130,20 +127,16 @@ def _measure(
     seed: int,
     max_steps: int,
 ) -> SuccessResult:
-    scenes, parts = SceneHash(), []
-    for number, (env, start, count) in enumerate(batches):
-        scenes.update(start, count)
-        device = start[keys.PIXELS].device
-        with evaluating(policy), seeded(derive(seed, "success", mode, number), device):
-            ended = play(policy, env, start, mode=mode, max_steps=max_steps)
-        parts.append([column[:count].cpu() for column in ended])
-    success, lengths, stopped = (torch.cat(column) for column in zip(*parts, strict=True))
+    def play_batch(env: EnvBase, start: TensorDictBase) -> Outcomes:
+        return play(policy, env, start, mode=mode, max_steps=max_steps)
+
+    (success, lengths, stopped), scenes = play_scenes(policy, batches, seed, mode, play_batch)
     return SuccessResult(
         rate=wilson(int(success.sum()), len(success)),
         stopped=wilson(int(stopped.sum()), len(success)),
         outcomes=success,
         lengths=lengths,
-        scenes=scenes.hexdigest(),
+        scenes=scenes,
         mode=mode,
     )
 

@@ -59,10 +59,7 @@ def word_evidence(
     with evaluating(policy):
         looks = trunk.looks(render(state, tile_size))
         seen = looks.where[0, :N_KINDS]
-        said = [
-            (looks.colour @ trunk.words.about_colour.weight.T)[seen][:, tokens],
-            (looks.form @ trunk.words.about_form.weight.T)[seen][:, tokens],
-        ]
+        said = [evidence[seen][:, tokens] for evidence in trunk.words.evidence(looks)]
     colour, form = (evidence - evidence.mean(0) for evidence in said)
     objects = tuple(kind_name(number) for number in range(1, N_KINDS + 1))
     return WordEvidence(tuple(words), objects, colour, form)

@@ -14,8 +14,7 @@ from torch import nn
 from ifo_grounding import seeding
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.shapes import Shapes
-from ifo_grounding.networks.trunk import patch_size
+from ifo_grounding.networks.shapes import Shapes, patch_size
 
 
 @dataclass(frozen=True)

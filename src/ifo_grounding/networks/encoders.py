@@ -146,6 +146,16 @@ class PatchEncoder(nn.Module):
         return -(-height // patch), -(-width // patch)
 
 
+def check_tokens(tokens: Tensor, words: int) -> None:
+    """Raise :class:`UserError` where a token id, of at least one, is none of so many words."""
+    lowest, highest = tokens.aminmax()
+    if lowest < 0 or highest >= words:
+        raise UserError(
+            f"instructions hold token ids from {int(lowest)} to {int(highest)}, but this "
+            f"network knows 0 to {words - 1}: build it with the vocabulary of the data"
+        )
+
+
 class InstructionEncoder(nn.Module):
     """Base of the encoders of instructions: each distinct instruction of a batch is encoded once.
 
@@ -177,13 +187,7 @@ class InstructionEncoder(nn.Module):
         distinct, inverse = distinct_rows(tokens.long())
         if not distinct.numel():
             return self.embedding.weight.new_zeros(len(distinct), self.size), inverse
-        words = self.embedding.num_embeddings
-        lowest, highest = distinct.aminmax()
-        if lowest < 0 or highest >= words:
-            raise UserError(
-                f"instructions hold token ids from {int(lowest)} to {int(highest)}, but this "
-                f"network knows 0 to {words - 1}: build it with the vocabulary of the data"
-            )
+        check_tokens(distinct, self.embedding.num_embeddings)
         longest = max(int(_lengths(distinct).max()), 1)
         return self._encode(distinct[:, :longest]), inverse
 

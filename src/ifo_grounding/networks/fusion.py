@@ -97,6 +97,16 @@ def _look(features: int, kernel: int) -> nn.Module:
     return nn.Conv2d(features, features, kernel, padding=kernel // 2)
 
 
+def cell_places(grid: tuple[int, int]) -> Tensor:
+    """Return the row and column of each cell in [-1, 1], [h * w, 2]; 0 along a side of one cell.
+
+    >>> cell_places((1, 2)).tolist()
+    [[0.0, -1.0], [0.0, 1.0]]
+    """
+    axes = [torch.linspace(-1, 1, length) if length > 1 else torch.zeros(1) for length in grid]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
+
+
 class SpatialReadout(nn.Module):
     """Where several attention maps look, and what they see there.
 
@@ -119,9 +129,7 @@ class SpatialReadout(nn.Module):
         # Maps that are sharp and unlike each other from the start learn many times sooner where
         # to look: flat ones all read the same mean, which tells nothing.
         nn.init.normal_(self.attention.weight, std=8 / math.sqrt(features))
-        axes = [torch.linspace(-1, 1, length) if length > 1 else torch.zeros(1) for length in grid]
-        place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
-        self.register_buffer("place", place, persistent=False)
+        self.register_buffer("place", cell_places(grid), persistent=False)
 
     def maps(self, image: Tensor) -> Tensor:
         """Return how each head weighs the cells of ``image`` [N, F, H, W]: [N, heads, H, W]."""

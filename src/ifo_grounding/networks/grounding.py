@@ -15,11 +15,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.errors import UserError
 from ifo_grounding.networks.cells import hidden_from_python, look_up
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import PatchEncoder, as_float, distinct_patches, patches
-from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.encoders import (
+    PatchEncoder,
+    as_float,
+    check_tokens,
+    distinct_patches,
+    patches,
+)
+from ifo_grounding.networks.fusion import cell_places
+from ifo_grounding.networks.shapes import Shapes, patch_size
 
 EVIDENCE = 16
 """Size of what a word is compared with."""
@@ -141,20 +147,22 @@ class WordMaps(nn.Module):
 
     def forward(self, looks: Looks, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps' logits [N, h * w, maps] and the manner [N, MANNER]."""
-        colour = looks.colour @ self.about_colour.weight.T  # [U, V]
-        form = looks.form @ self.about_form.weight.T
+        colour, form = self.evidence(looks)
         weights, manner = self.roles(tokens)
-        if self.training and not hidden_from_python(tokens):
-            said = tokens.unique()
-            said = said[said > 0]
-            self.charge = _spread(colour[:, said]) + _spread(form[:, said])
         spoken = weights.new_zeros(len(tokens), len(self.role.weight), weights.shape[-1])
         words = tokens.unsqueeze(-1).expand_as(weights)
         spoken = spoken.scatter_add(1, words, weights)  # [N, V, maps]
         if self.training and len(tokens) and not hidden_from_python(tokens):
+            said = tokens.unique()
+            said = said[said > 0]
+            self.charge = _spread(colour[:, said]) + _spread(form[:, said])
             self.usual.lerp_(spoken.detach().float().mean(0), USUAL)
         spoken = spoken - self.usual.to(spoken.dtype)
         return look_up(colour + form, looks.where) @ spoken, manner
+
+    def evidence(self, looks: Looks) -> tuple[Tensor, Tensor]:
+        """Return what each word says of the colours and of the form of each cell, [U, V] each."""
+        return looks.colour @ self.about_colour.weight.T, looks.form @ self.about_form.weight.T
 
     def roles(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much words count for each map [N, L, maps], and the manner [N, MANNER]."""
@@ -168,7 +176,7 @@ class WordMaps(nn.Module):
             side = side + SIDE_NOISE * torch.randn_like(side)
         around = F.relu(self.around((side * alive).movedim(-1, -2)))
         manner = self.manner((around * alive.movedim(-1, -2)).amax(-1))
-        return len(self.usual[0]) * relevance * alive, manner
+        return self.relevance.out_channels * relevance * alive, manner
 
 
 def swap_words(tokens: Tensor, share: float) -> Tensor:
@@ -207,24 +215,21 @@ class GroundedTrunk(nn.Module):
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__()
         channels, height, width = shapes.image_shape
-        patch = config.patch_size or shapes.tile_size or 8
+        patch = patch_size(shapes, config)
         self.looks = ColourAndForm(channels, config.features, patch)
         self.words = WordMaps(shapes.vocabulary_size, config.maps, config.hidden // 2)
         self.attention = nn.Linear(config.features, config.heads)
         nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
         self.value = nn.Linear(config.features, config.values)
-        axes = [
-            torch.linspace(-1, 1, length) if length > 1 else torch.zeros(1)
-            for length in PatchEncoder.grid(height, width, patch)
-        ]
-        place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
-        self.register_buffer("place", place, persistent=False)
+        places = cell_places(PatchEncoder.grid(height, width, patch))
+        self.register_buffer("place", places, persistent=False)
         maps = 2 * config.maps
         self.size = config.heads * (2 + config.values + maps) + 2 * maps + MANNER
 
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
-        self._check(tokens)
+        if tokens.numel() and not hidden_from_python(tokens):
+            check_tokens(tokens, self.words.role.num_embeddings)
         looks = self.looks(image)
         logits, manner = self.words(looks, tokens.long())
         # Evidence for a place or against it: which of the two a map learns is a matter of chance.
@@ -237,17 +242,6 @@ class GroundedTrunk(nn.Module):
         seen = attention @ torch.cat([place, silent[..., heads:], maps], -1)
         pointed = maps.transpose(1, 2) @ place
         return torch.cat([seen.flatten(1), pointed.flatten(1), manner], -1)
-
-    def _check(self, tokens: Tensor) -> None:
-        if hidden_from_python(tokens) or not tokens.numel():
-            return
-        lowest, highest = tokens.aminmax()
-        words = self.words.role.num_embeddings
-        if lowest < 0 or highest >= words:
-            raise UserError(
-                f"instructions hold token ids from {int(lowest)} to {int(highest)}, but this "
-                f"network knows 0 to {words - 1}: build it with the vocabulary of the data"
-            )
 
 
 def _spread(evidence: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torchrl.data import Unbounded
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks.config import NetworkConfig
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,11 @@ n_actions=6, tile_size=None)
                 )
         found["image_shape"] = tuple(int(size) for size in found["image_shape"])
         return cls(**{name: value for name, value in found.items() if value is not None})
+
+
+def patch_size(shapes: Shapes, config: NetworkConfig) -> int:
+    """Return the side of a patch: as configured, or the side of a tile, or 8 pixels."""
+    return config.patch_size or shapes.tile_size or 8
 
 
 def _attribute(source: Any, name: str) -> Any:

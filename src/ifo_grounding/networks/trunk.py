@@ -28,7 +28,7 @@ from ifo_grounding.networks.fusion import (
     SpatialReadout,
 )
 from ifo_grounding.networks.grounding import GroundedTrunk
-from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.shapes import Shapes, patch_size
 
 
 @functools.cache
@@ -133,11 +133,6 @@ def image_encoder(shapes: Shapes, config: NetworkConfig, images: int = 1) -> nn.
         return ConvEncoder(channels, config.features, config.conv_layers)
     patch = patch_size(shapes, config)
     return PatchEncoder(channels, config.features, patch)
-
-
-def patch_size(shapes: Shapes, config: NetworkConfig) -> int:
-    """Return the side of a patch: as configured, or the side of a tile, or 8 pixels."""
-    return config.patch_size or shapes.tile_size or 8
 
 
 def grid(shapes: Shapes, config: NetworkConfig) -> tuple[int, int]:

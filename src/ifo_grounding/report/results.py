@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
+
+import numpy as np
+from torch import Tensor
 
 from ifo_grounding.report.tables import text_table
 from ifo_grounding.stats import Difference, Estimate, Rate
@@ -67,6 +70,41 @@ def restored(kind: type[Measured], values: Mapping[str, Any]) -> Measured:
         key: math.nan if value is None else value for key, value in values.items()
     }
     return kind(**known)
+
+
+def brief(value: Measured) -> str:
+    """Return a measurement with its interval alone, in percent or points.
+
+    >>> from ifo_grounding.stats import wilson
+    >>> brief(wilson(9, 10))
+    '90.0% [59.6, 98.2]'
+    """
+    return str(value).rpartition(" (")[0].replace(" points", "")
+
+
+def packed(outcomes: Tensor) -> str:
+    """Return the success of each scene, bool [N], as hexadecimal digits of four scenes each."""
+    return np.packbits(outcomes.numpy()).tobytes().hex()
+
+
+def unpacked(runs: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
+    """Return the success of a policy on every scene of several runs, bool [runs, scenes].
+
+    Args:
+        runs: result files, whose scenes are the same.
+        name: of the policy in their results.
+
+    >>> import torch
+    >>> bits = packed(torch.tensor([True, False, True]))
+    >>> unpacked([{"results": {"phase1": {"outcomes": bits, "rate": {"count": 3}}}}], "phase1")
+    array([[ True, False,  True]])
+    """
+    rows = []
+    for run in runs:
+        result = run["results"][name]
+        bits = np.unpackbits(np.frombuffer(bytes.fromhex(result["outcomes"]), np.uint8))
+        rows.append(bits[: result["rate"]["count"]].astype(bool))
+    return np.stack(rows)
 
 
 def results_table(results: Mapping[str, Any]) -> str:

@@ -101,3 +101,15 @@ def markdown_table(rows: Sequence[Row], columns: Sequence[str] | None = None) ->
     rule = ["---:" if _aligned_right(rows, name) else "---" for name in names]
     escaped = [[text.replace("|", r"\|") for text in row] for row in _cells(rows, names)]
     return "\n".join(f"| {' | '.join(row)} |" for row in [names, rule, *escaped])
+
+
+def renewed(text: str, mark: str, part: str) -> str:
+    """Return a page with the part between two marks renewed.
+
+    >>> renewed("a <!-- x --> old <!-- /x --> b", "x", " new ")
+    'a <!-- x --> new <!-- /x --> b'
+    """
+    first, last = f"<!-- {mark} -->", f"<!-- /{mark} -->"
+    before, _, rest = text.partition(first)
+    _, _, after = rest.partition(last)
+    return f"{before}{first}{part}{last}{after}"
