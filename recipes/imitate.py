@@ -1,6 +1,7 @@
 """Imitate the labelled demonstrations: phase 1, which is BCO (paper, 1st-phase)."""
 
 import math
+from collections.abc import Callable
 
 from _shared import (
     POLICIES,
@@ -21,6 +22,7 @@ from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.seeding import derive
 from ifo_grounding.training import HeldOut, Run, Stage, fit
+from ifo_grounding.training.supervised import Metrics
 
 
 def imitate(options: DictConfig) -> dict:
@@ -44,6 +46,11 @@ def imitate(options: DictConfig) -> dict:
     )
 
 
+def imitation(options: DictConfig, seed: int) -> ImitationLoss:
+    """Return the loss of a policy with the initial weights of a seed."""
+    return ImitationLoss(build(make_policy, options, seed=seed))
+
+
 class Beginning:
     """One of the initial weights that are tried: some take many times longer to ground a word."""
 
@@ -54,21 +61,27 @@ class Beginning:
         seen: ReplayBuffer,
         held_out: ReplayBuffer | None,
         number: int,
+        imitation: Callable[[DictConfig, int], ImitationLoss] = imitation,
     ) -> None:
         self.options, self.stage, self.seen, self.number = options, stage, seen, number
         seed = derive(options.seed, "beginning", number) if number else options.seed
-        self.loss = ImitationLoss(build(make_policy, options, seed=seed))
+        self.loss = imitation(options, seed)
         self.validation = HeldOut(self.loss, held_out) if held_out is not None else None
         self.checkpoint = stage.checkpoint.with_stem(f"{stage.checkpoint.stem}-{number}")
 
     def try_out(self) -> float:
         """Learn for a few steps, leave a checkpoint to go on from, and return the loss."""
-        config = fit_config(self.options.imitate)
         steps = self.options.imitate.trial_steps
-        history = fit(
+        history = self.learn(until=steps)
+        iteration = fit_config(self.options.imitate).iteration
+        return history[: math.ceil(steps / iteration)][-1]["loss_imitation"]
+
+    def learn(self, until: int | None = None) -> list[Metrics]:
+        """Learn on from the checkpoint, up to some step or to the end."""
+        return fit(
             self.loss,
             self.seen,
-            config,
+            fit_config(self.options.imitate),
             seed=self.options.seed,
             name=self.stage.name,
             checkpoint=self.checkpoint,
@@ -76,9 +89,8 @@ class Beginning:
             held_out=self.validation,
             progress=shows_progress(self.options),
             settings=self.stage.settings,
-            until=steps,
+            until=until,
         )
-        return history[: math.ceil(steps / config.iteration)][-1]["loss_imitation"]
 
 
 def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, ReplayBuffer | None]:

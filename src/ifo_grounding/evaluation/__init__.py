@@ -5,6 +5,7 @@ Evaluation reads the truth (scenes, goals, rewards); learners never import it.
 
 from ifo_grounding.evaluation.endings import Endings, compare_endings, episode_endings
 from ifo_grounding.evaluation.labels import LabelAccuracy, label_accuracy
+from ifo_grounding.evaluation.probes import Probe, Probes, probe
 from ifo_grounding.evaluation.recording import Episode, record_episodes
 from ifo_grounding.evaluation.reward import (
     ReturnAudit,
@@ -38,6 +39,8 @@ __all__ = [
     "Episode",
     "Estimate",
     "LabelAccuracy",
+    "Probe",
+    "Probes",
     "Rate",
     "ReturnAudit",
     "RewardAudit",
@@ -54,6 +57,7 @@ __all__ = [
     "judged_choices",
     "label_accuracy",
     "paired_difference",
+    "probe",
     "record_episodes",
     "return_correlation",
     "reward_audit",

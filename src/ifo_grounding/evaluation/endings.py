@@ -59,7 +59,7 @@ class Endings:
     def shared(self) -> dict[str, int]:
         """Wrong objects by what they have in common with the right one."""
         wrong = self.kind == WRONG_OBJECT
-        colours, shapes = _looks(self.mistaken[wrong]), _looks(self.wanted[wrong])
+        colours, shapes = looks(self.mistaken[wrong]), looks(self.wanted[wrong])
         same_colour, same_shape = (a == b for a, b in zip(colours, shapes, strict=True))
         found = (3 - 2 * same_colour.long() - same_shape.long()).bincount(minlength=len(SHARED))
         return dict(zip(SHARED, found.tolist(), strict=True))
@@ -199,7 +199,7 @@ def _carried(first: WorldState, last: WorldState, wanted: Plan, goal: Goal) -> T
     return others.gather(-1, gone.byte().argmax(-1, keepdim=True)).squeeze(-1).long() * gone.any(-1)
 
 
-def _looks(kinds: Tensor) -> tuple[Tensor, Tensor]:
+def looks(kinds: Tensor) -> tuple[Tensor, Tensor]:
     """Return the numbers of the colours and of the shapes of object kinds."""
     return (kinds - 1) // len(SHAPES), (kinds - 1) % len(SHAPES)
 

@@ -29,12 +29,8 @@ from ifo_grounding.networks.shapes import Shapes, patch_size
 
 EVIDENCE = 16
 """Size of what a word is compared with."""
-ROLE, SWAPPED = 8, 0.8
-"""Size of the code from which a word's role is read, and the share of words that are swapped."""
-SIDE, SIDE_NOISE = 4, 0.7
-"""Size of the code from which the manner is read, and the noise on it in training."""
-USUAL = 0.05
-"""Share by which each batch in training changes what counts as usually said."""
+ROLE, SIDE = 8, 4
+"""Sizes of the codes from which a word's role and the manner are read."""
 MANNER = 8
 """Size of what the instruction says besides places: a side, for example."""
 CONTRAST = 8.0
@@ -67,7 +63,7 @@ class ColourAndForm(nn.Module):
 
     def __init__(self, channels: int, features: int, patch: int) -> None:
         super().__init__()
-        self.patch = patch
+        self.channels, self.patch = channels, patch
         half = features // 2
         self.pixel = nn.Sequential(
             nn.Linear(channels, half), nn.ReLU(), nn.Linear(half, half), nn.ReLU()
@@ -122,7 +118,14 @@ class WordMaps(nn.Module):
         charge: what the words of the last batch said in training: for each, the spread over
             cells of its evidence about colours plus that of its evidence about form. A loss that
             charges for it makes a word speak about one of the two.
+        swapped: share of the words that are swapped in training.
+        noise: on the code from which the manner is read, in training.
+        pace: share by which each batch in training changes what counts as usually said.
     """
+
+    swapped = 0.8
+    noise = 0.7
+    pace = 0.05
 
     usual: Tensor
     """How much each word usually counts for each map, which tells nothing: [V, maps]."""
@@ -156,7 +159,7 @@ class WordMaps(nn.Module):
             said = tokens.unique()
             said = said[said > 0]
             self.charge = _spread(colour[:, said]) + _spread(form[:, said])
-            self.usual.lerp_(spoken.detach().float().mean(0), USUAL)
+            self.usual.lerp_(spoken.detach().float().mean(0), self.pace)
         spoken = spoken - self.usual.to(spoken.dtype)
         return look_up(colour + form, looks.where) @ spoken, manner
 
@@ -167,13 +170,13 @@ class WordMaps(nn.Module):
     def roles(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much words count for each map [N, L, maps], and the manner [N, MANNER]."""
         alive = (tokens != 0).unsqueeze(-1)
-        heard = swap_words(tokens, SWAPPED) if self.training else tokens
+        heard = swap_words(tokens, self.swapped) if self.training else tokens
         code = torch.tanh(self.role(heard)) * alive
         beside = F.relu(self.beside(code.movedim(-1, -2)))
         relevance = self.relevance(beside).movedim(-2, -1).softmax(-1)
         side = torch.tanh(self.side(tokens))
         if self.training:
-            side = side + SIDE_NOISE * torch.randn_like(side)
+            side = side + self.noise * torch.randn_like(side)
         around = F.relu(self.around((side * alive).movedim(-1, -2)))
         manner = self.manner((around * alive.movedim(-1, -2)).amax(-1))
         return self.relevance.out_channels * relevance * alive, manner
@@ -208,9 +211,14 @@ class GroundedTrunk(nn.Module):
     Attention maps of two kinds read the image: those of :class:`WordMaps`, which give places and
     nothing else, and those that see silhouettes and no words, which give places, what is seen
     there, and how much of each word map lies there.
+
+    Attributes:
+        both_ways: whether each word map is read as evidence for places and as evidence against
+            them. Which of the two finds its target is a matter of chance.
     """
 
     place: Tensor
+    both_ways = True
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__()
@@ -232,8 +240,7 @@ class GroundedTrunk(nn.Module):
             check_tokens(tokens, self.words.role.num_embeddings)
         looks = self.looks(image)
         logits, manner = self.words(looks, tokens.long())
-        # Evidence for a place or against it: which of the two a map learns is a matter of chance.
-        maps = torch.cat([logits, -logits], -1).softmax(1)  # [N, h * w, 2 * maps]
+        maps = self.weigh(logits)
         silent = torch.cat([self.attention(looks.silhouette), self.value(looks.silhouette)], -1)
         silent = look_up(silent, looks.where)
         heads = self.attention.out_features
@@ -242,6 +249,20 @@ class GroundedTrunk(nn.Module):
         seen = attention @ torch.cat([place, silent[..., heads:], maps], -1)
         pointed = maps.transpose(1, 2) @ place
         return torch.cat([seen.flatten(1), pointed.flatten(1), manner], -1)
+
+    def weigh(self, logits: Tensor) -> Tensor:
+        """Weigh cells by evidence for them and by evidence against them: [N, h * w, 2 * maps]."""
+        return torch.cat([logits, -logits if self.both_ways else logits], -1).softmax(1)
+
+    def cells(self, image: Tensor) -> Tensor:
+        """Return what words and silent heads see of each cell of [N, C, H, W]: [N, h * w, F]."""
+        looks = self.looks(image)
+        return look_up(torch.cat([looks.colour, looks.form, looks.silhouette], -1), looks.where)
+
+    def maps(self, image: Tensor, tokens: Tensor) -> Tensor:
+        """Return how each map weighs the cells of an image: [N, 2 * maps, h * w]."""
+        logits, _ = self.words(self.looks(image), tokens.long())
+        return self.weigh(logits).transpose(1, 2)
 
 
 def _spread(evidence: Tensor) -> Tensor:

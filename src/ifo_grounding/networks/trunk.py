@@ -194,6 +194,21 @@ class Trunk(nn.Module):
             features = fuse(features, instruction)
         return F.relu(features)
 
+    def cells(self, image: Tensor) -> Tensor:
+        """Return the features of each cell of [N, C, H, W] before any word: [N, h * w, F]."""
+        return self.context(self.image(image)).flatten(2).transpose(1, 2)
+
+    def maps(self, image: Tensor, tokens: Tensor) -> Tensor:
+        """Return how each head weighs the cells of an image: [N, heads, h * w].
+
+        The paper's network has no heads: its one map is what all gates together let through.
+        """
+        fused = self.fuse(image, tokens)
+        if self.readout is not None:
+            return self.readout.maps(fused).flatten(2)
+        let_through = fused.sum(1, keepdim=True).flatten(2)
+        return let_through / let_through.sum(-1, keepdim=True).clamp_min(1e-9)
+
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
         if self.readout is None:

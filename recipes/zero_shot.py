@@ -1,0 +1,160 @@
+"""Zero-shot, one part at a time: what the preset `grounded` owes to each of its parts.
+
+python recipes/zero_shot.py task=move seed=0
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from _results import keep_result, write_result
+from _shared import open_run, open_stage, simulator
+from collect_transitions import collect
+from evaluate import evaluation_scenes
+from imitate import Beginning, labelled_demonstrations
+from label import label
+from omegaconf import DictConfig
+from record_demonstrations import record
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
+from train_inverse import train_inverse
+
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.errors import check_choice
+from ifo_grounding.evaluation import episode_endings, probe
+from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
+from ifo_grounding.networks.grounding import EVIDENCE, Looks
+from ifo_grounding.networks.transfer import trunk_of
+from ifo_grounding.objectives import ImitationLoss
+from ifo_grounding.report import text_table
+from ifo_grounding.report.results import brief, packed
+from ifo_grounding.stats import wilson
+
+
+class SeenWhole(ColourAndForm):
+    """Sees a cell as a whole: for words, for the silent heads, or for both."""
+
+    def __init__(self, channels: int, features: int, patch: int, for_words: bool) -> None:
+        super().__init__(channels, features, patch)
+        self.for_words = for_words
+        self.look = nn.Sequential(nn.Linear(channels * patch**2, features), nn.ReLU())
+        self.apart = nn.Linear(features, 2 * EVIDENCE)
+
+    def forward(self, image: Tensor) -> Looks:
+        """See an image [N, C, H, W], its distinct cells once."""
+        looks = super().forward(image)
+        tiles, _ = self.tiles(image)
+        seen = self.look(tiles.flatten(1))
+        if not self.for_words:
+            return looks._replace(silhouette=seen)
+        colour, form = (F.layer_norm(e, (EVIDENCE,)) for e in self.apart(seen).chunk(2, -1))
+        return looks._replace(colour=colour, form=form)
+
+
+def see_whole(for_words: bool) -> Callable[[GroundedTrunk, ImitationLoss], None]:
+    def change(trunk: GroundedTrunk, loss: ImitationLoss) -> None:
+        looks = trunk.looks
+        trunk.looks = SeenWhole(looks.channels, looks.outline.out_features, looks.patch, for_words)
+
+    return change
+
+
+def one_way(trunk: GroundedTrunk, loss: ImitationLoss) -> None:
+    trunk.both_ways = False
+
+
+def no_charge(trunk: GroundedTrunk, loss: ImitationLoss) -> None:
+    loss.charge = 0.0
+
+
+def no_swaps(trunk: GroundedTrunk, loss: ImitationLoss) -> None:
+    trunk.words.swapped = 0.0
+
+
+def no_noise(trunk: GroundedTrunk, loss: ImitationLoss) -> None:
+    trunk.words.noise = 0.0
+
+
+CHANGES: dict[str, Callable[[GroundedTrunk, ImitationLoss], None]] = {
+    "cells-whole": see_whole(for_words=True),
+    "silent-whole": see_whole(for_words=False),
+    "no-charge": no_charge,
+    "no-swaps": no_swaps,
+    "no-noise": no_noise,
+    "one-way": one_way,
+}
+WHOLE, SENTENCE = "whole", "sentence"
+VARIANTS = (WHOLE, SENTENCE, *CHANGES)
+"""The whole preset, the preset `strong`, and what is changed in one part alone."""
+
+
+def compare(options: DictConfig) -> dict[str, dict]:
+    """Imitate the same demonstrations with each variant, and measure what it does and sees."""
+    for name in options.variants:
+        check_choice("variant", name, VARIANTS)
+    for prepare in (collect, train_inverse, record, label):
+        prepare(options)
+    seen, _ = labelled_demonstrations(open_run(options), 0.0)
+    return {name: imitate_with(name, seen, options) for name in options.variants}
+
+
+def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
+    """Imitate with one variant and keep what was measured."""
+    stage = open_stage(options, f"zero-shot-{name}", ["imitate", "evaluate"], ["label"])
+    results = stage.result
+    if results is None:
+        make = functools.partial(beginning, name)
+        count = options.imitate.trials
+        tried = [Beginning(options, stage, seen, None, number, make) for number in range(count)]
+        best = min(tried, key=lambda one: one.try_out())
+        best.learn()
+        results = stage.finish(measured(best.loss.network, options))
+    options.variant = name
+    keep_result(options, write_result(options, results, "run zero_shot"))
+    return results
+
+
+def beginning(name: str, options: DictConfig, seed: int) -> ImitationLoss:
+    """Build a variant with the initial weights of a seed."""
+    preset = "strong" if name == SENTENCE else "grounded"
+    loss = ImitationLoss(make_policy(simulator(options), preset, seed=seed, device=options.device))
+    if name in CHANGES:
+        trunk = trunk_of(loss.network)
+        assert isinstance(trunk, GroundedTrunk)
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            CHANGES[name](trunk, loss)
+        trunk.to(options.device)
+    return loss
+
+
+def measured(policy: nn.Module, options: DictConfig) -> dict[str, Any]:
+    """Measure success on held-out and trained pairs, how episodes end, and the probes."""
+    shown = evaluation_scenes(options, options.evaluate.episodes)
+    results: dict[str, Any] = {}
+    for name, split in (("held-out", "zero-shot"), ("trained", "train")):
+        ends = episode_endings(policy, options.task, **{**shown, "split": split})
+        results[name] = {**ends.as_dict(), "outcomes": packed(ends.kind == 0)}
+    asked = {key: shown[key] for key in ("seed", "stream", "holdout")}
+    results["probes"] = probe(policy, options.task, **asked).as_dict()
+    return results
+
+
+@recipe_main
+def main(options: DictConfig) -> None:
+    rows = [
+        {"variant": name, **{part: rate(found[part]) for part in ("held-out", "trained")}}
+        for name, found in compare(options).items()
+    ]
+    print(text_table(rows))
+
+
+def rate(ends: dict[str, Any]) -> str:
+    """Return the share of episodes that ended in success, with its interval."""
+    return brief(wilson(ends["counts"]["success"], sum(ends["counts"].values())))
+
+
+if __name__ == "__main__":
+    main()

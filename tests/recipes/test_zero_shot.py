@@ -1,0 +1,75 @@
+"""Variants of the preset `grounded`, each trained on the same labels."""
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.files import read_json
+
+TINY = (
+    "budget=tiny",
+    "progress=false",
+    "demonstrations.n=60",
+    "imitate.steps=20",
+    "imitate.trials=2",
+    "imitate.trial_steps=10",
+    "evaluate.episodes=30",
+)
+
+
+@pytest.fixture
+def options(recipes, tmp_path, monkeypatch):
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path))
+
+    def composed(*overrides):
+        with initialize_config_dir(version_base=None, config_dir=str(recipes / "conf")):
+            return compose("zero_shot", [*TINY, "run=one", f"results={tmp_path}", *overrides])
+
+    return composed
+
+
+def test_variants_leave_a_file_each_and_are_made_once(options, tmp_path):
+    from zero_shot import compare
+
+    found = compare(options("variants=[whole,cells-whole]"))
+    file = tmp_path / "move-60-grounded-cells-whole-seed0.json"
+    assert read_json(file)["results"] == found["cells-whole"]
+    assert sum(found["whole"]["held-out"]["counts"].values()) == 30
+    trained = set(found["whole"]["trained"]["by_object"])
+    assert not trained & {"blue circle", "blue triangle", "red rectangle"}
+    assert compare(options("variants=[whole]"))["whole"] == found["whole"]
+    with pytest.raises(UserError, match="unknown variant 'hole'"):
+        compare(options("variants=[hole]"))
+
+
+def test_each_variant_changes_what_it_says(options):
+    from zero_shot import CHANGES, SENTENCE, WHOLE, beginning
+
+    from ifo_grounding.networks.transfer import trunk_of
+
+    given = options()
+    image = torch.randint(256, (4, 3, 48, 48), dtype=torch.uint8)
+    tokens = torch.randint(1, 20, (4, 16))
+
+    def answers(name):
+        loss = beginning(name, given, 0)
+        torch.manual_seed(0)
+        trunk = trunk_of(loss.network)
+        played = trunk.eval()(image, tokens)
+        return trunk.train()(image, tokens), played, loss.charge
+
+    trained, played, charge = answers(WHOLE)
+    for name in CHANGES:
+        training, playing, cost = answers(name)
+        same = training.equal(trained), playing.equal(played), cost == charge
+        expected = {
+            "cells-whole": (False, False, True),
+            "silent-whole": (False, False, True),
+            "one-way": (False, False, True),
+            "no-swaps": (False, True, True),
+            "no-noise": (False, True, True),
+            "no-charge": (True, True, False),
+        }
+        assert same == expected[name], name
+    assert answers(SENTENCE)[0].shape != trained.shape
