@@ -1,15 +1,25 @@
 """Write the report of a run: table, curves, chosen instructions and episodes, as one page."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from _shared import CLASSIFIER, POLICIES, load_demonstrations, load_network, open_run
+from _shared import (
+    CLASSIFIER,
+    GOAL,
+    POLICIES,
+    REWARD,
+    load_demonstrations,
+    load_network,
+    open_run,
+)
 from evaluate import evaluate, evaluation_world
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictModule
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.evaluation import Rate, record_episodes
+from ifo_grounding.evaluation import Rate, record_episodes, trace_episode
 from ifo_grounding.files import read_json
 from ifo_grounding.report import (
     animation,
@@ -19,6 +29,7 @@ from ifo_grounding.report import (
     reliability_diagram,
     results_rows,
     success_over_iterations,
+    trace_animation,
     training_curves,
     write_report,
 )
@@ -38,7 +49,7 @@ CURVES = {
         ["learned_return", "episode_length", "stopped", "entropy", "served_share", "clip_fraction"],
     ),
 }
-EPISODES = 4
+EPISODES, TRACED = 4, 2
 
 
 def report(options: DictConfig) -> Path:
@@ -85,8 +96,9 @@ def episode_pictures(run: Run, options: DictConfig) -> dict[str, Any]:
     episodes = record_episodes(policies[-1], options.task, range(EPISODES), **shown)
     found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES)
     if len(policies) == 1:
-        return found
+        return found | step_by_step(policies[0], range(TRACED), run, options)
     before, after = torch.load(run / "outcomes.pt", weights_only=True)
+    improved = (after & ~before).nonzero().squeeze(-1)[:TRACED].tolist()
     for title, changed in {
         "Solved by phase 2 alone": after & ~before,
         "Solved by phase 1 alone": before & ~after,
@@ -97,7 +109,26 @@ def episode_pictures(run: Run, options: DictConfig) -> dict[str, Any]:
                 policies[0], policies[1], options.task, scenes, **shown
             )
             found[title] = animation(tries, titles=titles, columns=len(scenes))
-    return found
+    return found | step_by_step(policies[1], improved or range(TRACED), run, options)
+
+
+def step_by_step(
+    policy: TensorDictModule, scenes: Sequence[int], run: Run, options: DictConfig
+) -> dict[str, bytes]:
+    """Animate episodes with action probabilities, the judges' verdicts and attention."""
+    judges = {
+        name: load_network(run, file, recipe, options)
+        for name, file, recipe in (("action", REWARD, "train_reward"), ("goal", GOAL, "train_goal"))
+        if (run / file).exists()
+    }
+    seed, stream = options.evaluate.seed, options.evaluate.stream
+    shown = {"seed": seed, "stream": stream, **evaluation_world(options)}
+    return {
+        f"Step by step, scene {episode.scene}": trace_animation(
+            trace_episode(policy, episode, judges)
+        )
+        for episode in record_episodes(policy, options.task, scenes, **shown)
+    }
 
 
 def curves(run: Run) -> dict[str, Any]:

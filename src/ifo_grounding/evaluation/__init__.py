@@ -19,6 +19,7 @@ from ifo_grounding.evaluation.suitability import (
     judged_choices,
     suitable_rate,
 )
+from ifo_grounding.evaluation.tracing import Trace, trace_episode
 from ifo_grounding.evaluation.words import WordEvidence, word_evidence
 from ifo_grounding.modules import evaluating
 from ifo_grounding.stats import (
@@ -46,6 +47,7 @@ __all__ = [
     "RewardAudit",
     "SuccessResult",
     "SuitabilityResult",
+    "Trace",
     "WordEvidence",
     "auc",
     "compare_endings",
@@ -63,6 +65,7 @@ __all__ = [
     "reward_audit",
     "success_rate",
     "suitable_rate",
+    "trace_episode",
     "two_level_bootstrap",
     "wilson",
     "word_evidence",

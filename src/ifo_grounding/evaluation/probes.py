@@ -16,7 +16,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.endings import looks
 from ifo_grounding.evaluation.episodes import device_of
 from ifo_grounding.modules import evaluating
-from ifo_grounding.networks import GroundedTrunk
+from ifo_grounding.networks import GroundedTrunk, attention_maps
 from ifo_grounding.networks.transfer import trunk_of
 from ifo_grounding.networks.trunk import Trunk, encode_instruction
 from ifo_grounding.tasks.grammar import grammar, holdout_kinds
@@ -118,7 +118,7 @@ def probe(
         read: tuple[Probe | None, Probe | None] = (None, None)
         if isinstance(trunk, Trunk):
             read = _linear(*_sentences(trunk, trained, held_out), named)
-        matching = _matching(trunk, trained, held_out)
+        matching = _matching(policy, trained, held_out)
     return Probes(colour, shape, *read, matching)
 
 
@@ -185,11 +185,11 @@ def _logistic(features: Tensor, truth: Tensor, count: int) -> nn.Linear:
     return layer
 
 
-def _matching(trunk: Trunk | GroundedTrunk, trained: _Scenes, held_out: _Scenes) -> Probe:
+def _matching(policy: nn.Module, trained: _Scenes, held_out: _Scenes) -> Probe:
     """Return the weight that the best map lays on the cell of the object asked for."""
     on_target = []
     for part in (trained, held_out):
-        maps = trunk.maps(part.pixels, part.instruction).float()  # [N, maps, cells]
+        maps = attention_maps(policy, part.pixels, part.instruction).flatten(2)
         cell = part.cell.view(-1, 1, 1).expand(-1, maps.shape[1], 1)
         on_target.append(maps.gather(2, cell).squeeze(2).mean(0))
     best = int(on_target[0].argmax())

@@ -1,5 +1,6 @@
 """The networks: encoders, fusion, and six TensorDictModules built from specs."""
 
+from ifo_grounding.networks.attention import attention_maps
 from ifo_grounding.networks.building import Blueprint
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
@@ -55,6 +56,7 @@ __all__ = [
     "SpatialReadout",
     "ValueNetwork",
     "WordMaps",
+    "attention_maps",
     "from_pretrained",
     "load",
     "make_goal_judge",

@@ -19,10 +19,15 @@ def trunk_of(policy: nn.Module) -> Trunk | GroundedTrunk:
     >>> trunk_of(make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))).size
     144
     """
-    trunks = [part.trunk for part in policy.modules() if isinstance(part, InstructedNetwork)]
-    if len(trunks) != 1:
-        raise UserError("init_from must be a policy built by make_policy")
-    return trunks[0]
+    return instructed_network(policy).trunk
+
+
+def instructed_network(policy: nn.Module) -> InstructedNetwork:
+    """Return the network within a policy that ``make_policy`` built."""
+    found = [part for part in policy.modules() if isinstance(part, InstructedNetwork)]
+    if len(found) != 1:
+        raise UserError("this must be a policy built by make_policy")
+    return found[0]
 
 
 def copy_weights(

@@ -24,6 +24,7 @@ from ifo_grounding.report.provenance import provenance
 from ifo_grounding.report.rates import compared_rates, rates_by_number, reliability_diagram
 from ifo_grounding.report.results import results_rows, results_table
 from ifo_grounding.report.tables import format_cell, markdown_table, text_table
+from ifo_grounding.report.tracing import trace_animation
 
 __all__ = [
     "Case",
@@ -50,6 +51,7 @@ __all__ = [
     "save_figure",
     "success_over_iterations",
     "text_table",
+    "trace_animation",
     "training_curves",
     "write_report",
 ]

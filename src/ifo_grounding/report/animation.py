@@ -65,7 +65,7 @@ def animation(
         sheet.draw([_cell(e, label, step) for e, label in zip(episodes, labels, strict=True)])
         for step in range(steps)
     ]
-    return _gif(pictures, fps, hold)
+    return gif(pictures, fps, hold)
 
 
 def save_animation(path: str | Path, episodes: Sequence[Episode], **options: object) -> Path:
@@ -91,7 +91,8 @@ def _cell(episode: Episode, title: str, step: int) -> Cell:
     return Cell(frame, episode.sentence, title, note, GOOD if episode.success else BAD)
 
 
-def _gif(pictures: Sequence[Image.Image], fps: float, hold: float) -> bytes:
+def gif(pictures: Sequence[Image.Image], fps: float, hold: float) -> bytes:
+    """Return pictures of one size as a GIF that repeats, the last one held for some seconds."""
     # One palette, from the first and the last picture, keeps colours from flickering.
     both = Image.new("RGB", (pictures[0].width, 2 * pictures[0].height))
     both.paste(pictures[0], (0, 0))

@@ -131,7 +131,8 @@ class SceneStream:
                 return _cat(kept).to(self.device)
         raise UserError(
             f"after {PATIENCE * CHUNK} draws only {CHUNK - missing} scenes admit a suitable goal "
-            f"of {options.task!r} in split {options.split!r}: give the layout more objects or boxes"
+            f"of {options.task!r} in split {options.split!r} within {options.max_steps} steps: "
+            "give the layout more objects or boxes, or episodes more steps"
         )
 
     def _propose(self, draw: torch.Generator) -> Scene:

@@ -1,0 +1,78 @@
+"""What went on inside a policy and its judges during an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from ifo_grounding import keys
+from ifo_grounding.evaluation.episodes import device_of
+from ifo_grounding.evaluation.recording import Episode
+from ifo_grounding.modules import evaluating
+from ifo_grounding.networks.attention import attention_maps
+from ifo_grounding.tasks.vocabulary import VOCABULARY
+
+
+@dataclass(frozen=True)
+class Trace:
+    """An episode of T steps with what decided them."""
+
+    episode: Episode
+    """What happened."""
+    probabilities: np.ndarray
+    """Of the A actions at each step, float32 [T, A]."""
+    maps: np.ndarray
+    """How each of M maps weighs the cells at each step, float32 [T, M, h, w]."""
+    rewards: dict[str, np.ndarray]
+    """What each judge says of each step, a probability, float32 [T]."""
+
+
+@torch.no_grad()
+def trace_episode(
+    policy: TensorDictModule,
+    episode: Episode,
+    judges: Mapping[str, TensorDictModule] | None = None,
+) -> Trace:
+    """Ask a policy and judges about each step of an episode.
+
+    Args:
+        policy: built by ``make_policy``.
+        episode: from :func:`record_episodes`, its frames as the policy sees them.
+        judges: by name: reward modules, which judge the action that was taken, and goal judges,
+            which say whether the instruction is fulfilled where the arm was then.
+
+    >>> from ifo_grounding.envs import PickAndPlaceEnv
+    >>> from ifo_grounding.evaluation import record_episodes
+    >>> from ifo_grounding.networks import make_goal_judge, make_policy
+    >>> env = PickAndPlaceEnv("move", num_envs=1)
+    >>> policy = make_policy(env, seed=0)
+    >>> (episode,) = record_episodes(policy, "move", [0])
+    >>> trace = trace_episode(policy, episode, {"goal": make_goal_judge(env, seed=0)})
+    >>> trace.probabilities.shape[1], trace.maps.shape[1:], sorted(trace.rewards)
+    (6, (8, 6, 6), ['goal'])
+    """
+    steps, device = len(episode.actions), device_of(policy)
+    frames = torch.from_numpy(episode.frames[:-1]).to(device)
+    seen = TensorDict(
+        {
+            keys.PIXELS: frames,
+            keys.INITIAL_PIXELS: frames[:1].expand_as(frames),
+            keys.INSTRUCTION: VOCABULARY.encode([episode.sentence]).to(device).expand(steps, -1),
+            keys.ACTION: torch.from_numpy(episode.actions).to(device),
+        },
+        batch_size=[steps],
+    )
+    with evaluating(policy):
+        maps = attention_maps(policy, frames, seen[keys.INSTRUCTION])
+        probabilities = policy.get_dist(seen.copy()).probs
+    rewards = {}
+    for name, judge in (judges or {}).items():
+        with evaluating(judge):
+            logit = judge(seen.select(*judge.in_keys))[judge.out_keys[0]]
+        rewards[name] = logit.sigmoid().flatten().cpu().numpy()
+    return Trace(episode, probabilities.cpu().numpy(), maps.cpu().numpy(), rewards)
