@@ -23,6 +23,7 @@ from ifo_grounding.tasks.grammar import HOLDOUTS
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tables.md"
 ZERO_SHOT = ROOT / "docs" / "zero-shot.md"
+PARTS = ROOT / "results" / "zero-shot"
 PRESETS = ("paper", "strong", "grounded")
 PAPER_EPISODES = 500
 """The paper's rates are multiples of 0.2%: they look like this many episodes each."""
@@ -40,7 +41,7 @@ TABLE_4 = dict(
 ERRORS, FAILURES = REASONS[1:], ENDINGS[1:]
 NOT_RUN = "not run"
 
-Pieces = dict[tuple[str, str, str], list[dict[str, Any]]]
+Pieces = dict[Any, list[dict[str, Any]]]
 
 
 def pieces() -> Pieces:
@@ -233,13 +234,64 @@ def zero_shot_row(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
     return row
 
 
+VARIANTS = {
+    "whole": "the preset",
+    "sentence": "preset `strong`: the instruction as one vector",
+    "cells-whole": "words see whole cells, not colour and form",
+    "silent-whole": "what hears no words sees colours too",
+    "no-charge": "speaking is free",
+    "no-swaps": "roles hear the words themselves",
+    "no-noise": "the manner hears words without noise",
+    "one-way": "maps are read one way",
+}
+"""What each variant of `recipes/zero_shot.py` is."""
+PROBES = {
+    "seeing_colour": "sees colour",
+    "seeing_shape": "sees shape",
+    "reading_colour": "reads colour",
+    "reading_shape": "reads shape",
+    "matching": "matches",
+}
+"""What each probe asks, as a column."""
+
+
+def parts_content() -> str:
+    """Return the table of what each part of the preset does, one part left out at a time."""
+    found: Pieces = {}
+    for path in sorted(PARTS.glob("*.json")):
+        run = read_json(path)
+        found.setdefault(run["options"]["variant"], []).append(run)
+    rows = [part_row(said, found[name]) for name, said in VARIANTS.items() if name in found]
+    return f"{table(rows)}\n\n{commands(found)}"
+
+
+def part_row(said: str, runs: list[dict[str, Any]]) -> dict[str, str]:
+    """Return what a variant does and sees."""
+    found = [run["results"] for run in runs]
+    row = {"": said}
+    for part in ("held-out", "trained"):
+        rate = brief(two_level_bootstrap(outcomes(runs, part)))
+        each = ", ".join(f"{100 * one[part]['rate']['rate']:.0f}" for one in found)
+        row[f"{part} pairs"] = f"{rate}<br>seeds: {each}" if len(runs) > 1 else rate
+    for name, shown in PROBES.items():
+        row[shown] = probed([one["probes"][name] for one in found])
+    return row
+
+
+def probed(found: list[dict[str, float] | None]) -> str:
+    """Return the means over seeds of a probe on trained and on held-out pairs, in percent."""
+    known = [one for one in found if one is not None]
+    means = (100 * sum(one[part] for one in known) / len(known) for part in ("trained", "held_out"))
+    return " / ".join(f"{mean:.0f}" for mean in means) if known else ""
+
+
 def written() -> dict[Path, str]:
     """Return what each page should say."""
-    parts = {PAGE: ("tables", content()), ZERO_SHOT: ("zero-shot", zero_shot_content())}
-    return {
-        path: renewed(path.read_text(), mark, f"\n\n{part}\n\n")
-        for path, (mark, part) in parts.items()
-    }
+    tables = renewed(PAGE.read_text(), "tables", f"\n\n{content()}\n\n")
+    zero_shot = ZERO_SHOT.read_text()
+    for mark, part in (("zero-shot", zero_shot_content()), ("parts", parts_content())):
+        zero_shot = renewed(zero_shot, mark, f"\n\n{part}\n\n")
+    return {PAGE: tables, ZERO_SHOT: zero_shot}
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ python recipes/zero_shot.py task=move seed=0
 
 import functools
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -29,8 +30,8 @@ from ifo_grounding.networks.grounding import EVIDENCE, Looks
 from ifo_grounding.networks.transfer import trunk_of
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.report import text_table
-from ifo_grounding.report.results import brief, packed
-from ifo_grounding.stats import wilson
+from ifo_grounding.report.results import brief, packed, restored
+from ifo_grounding.stats import Rate, wilson
 
 
 class SeenWhole(ColourAndForm):
@@ -136,7 +137,8 @@ def measured(policy: nn.Module, options: DictConfig) -> dict[str, Any]:
     results: dict[str, Any] = {}
     for name, split in (("held-out", "zero-shot"), ("trained", "train")):
         ends = episode_endings(policy, options.task, **{**shown, "split": split})
-        results[name] = {**ends.as_dict(), "outcomes": packed(ends.kind == 0)}
+        won = wilson(ends.counts["success"], len(ends.kind))
+        results[name] = {**ends.as_dict(), "rate": asdict(won), "outcomes": packed(ends.kind == 0)}
     asked = {key: shown[key] for key in ("seed", "stream", "holdout")}
     results["probes"] = probe(policy, options.task, **asked).as_dict()
     return results
@@ -144,16 +146,12 @@ def measured(policy: nn.Module, options: DictConfig) -> dict[str, Any]:
 
 @recipe_main
 def main(options: DictConfig) -> None:
+    parts = ("held-out", "trained")
     rows = [
-        {"variant": name, **{part: rate(found[part]) for part in ("held-out", "trained")}}
+        {"variant": name, **{part: brief(restored(Rate, found[part]["rate"])) for part in parts}}
         for name, found in compare(options).items()
     ]
     print(text_table(rows))
-
-
-def rate(ends: dict[str, Any]) -> str:
-    """Return the share of episodes that ended in success, with its interval."""
-    return brief(wilson(ends["counts"]["success"], sum(ends["counts"].values())))
 
 
 if __name__ == "__main__":
