@@ -5,7 +5,8 @@ from typing import Any
 
 import torch
 from _shared import CLASSIFIER, POLICIES, load_demonstrations, load_network, open_run
-from evaluate import evaluate, evaluation_world
+from _worlds import World, open_world
+from evaluate import evaluate, evaluation_scenes
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
@@ -44,17 +45,17 @@ EPISODES = 4
 def report(options: DictConfig) -> Path:
     run = open_run(options)
     results = evaluate(options)
-    pictures: dict[str, Any] = episode_pictures(run, options)
-    if (run / CLASSIFIER).exists():
+    world = open_world(options)
+    pictures: dict[str, Any] = episode_pictures(run, world)
+    if world.oracle and (run / CLASSIFIER).exists():
         pictures["Chosen instructions"] = instruction_cases(
             load_network(run, CLASSIFIER, "train_instruction", options),
-            options.task,
+            world.task,
             load_demonstrations(run).pool(),
             threshold=options.instruction.threshold,
             candidates=options.instruction.candidates,
             choose=options.instruction.choose,
-            stream="validation",
-            **evaluation_world(options),
+            **world.arguments(split=options.evaluate.split, stream="validation"),
         )
         pictures["How often random pairs are suitable, against what is said"] = reliability_diagram(
             [(said, restored(Rate, rate)) for said, rate in results["suitability"]["reliability"]]
@@ -70,20 +71,19 @@ def report(options: DictConfig) -> Path:
     )
 
 
-def episode_pictures(run: Run, options: DictConfig) -> dict[str, Any]:
+def episode_pictures(run: Run, world: World) -> dict[str, Any]:
     """Animate episodes: scenes that phase 2 gained and lost, or some of phase 1."""
     found: dict[str, Any] = {}
     policies = [
-        load_network(run, file, "imitate", options) for file in POLICIES if (run / file).exists()
+        load_network(run, file, "imitate", world.options)
+        for file in POLICIES
+        if (run / file).exists()
     ]
-    shown = {
-        "seed": options.evaluate.seed,
-        "stream": options.evaluate.stream,
-        "render_tile_size": 32,
-        **evaluation_world(options),
-    }
-    episodes = record_episodes(policies[-1], options.task, range(EPISODES), **shown)
-    found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES)
+    where = evaluation_scenes(world.options)
+    drawn: dict[str, Any] = {"actions": world.actions}
+    place, shown = world.pictured(list(range(EPISODES)), **where)
+    episodes = record_episodes(policies[-1], place, **shown)
+    found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES, **drawn)
     if len(policies) == 1:
         return found
     before, after = torch.load(run / "outcomes.pt", weights_only=True)
@@ -93,10 +93,9 @@ def episode_pictures(run: Run, options: DictConfig) -> dict[str, Any]:
     }.items():
         scenes = changed.nonzero().squeeze(-1)[:EPISODES].tolist()
         if scenes:
-            tries, titles = improved_episodes(
-                policies[0], policies[1], options.task, scenes, **shown
-            )
-            found[title] = animation(tries, titles=titles, columns=len(scenes))
+            place, shown = world.pictured(scenes, **where)
+            tries, titles = improved_episodes(policies[0], policies[1], place, **shown)
+            found[title] = animation(tries, titles=titles, columns=len(scenes), **drawn)
     return found
 
 

@@ -1,6 +1,7 @@
 """Train the goal judge: whether an instruction is fulfilled (an extension of the paper)."""
 
-from _shared import GOAL, build, load_demonstrations, open_stage, starting_policy, train
+from _shared import GOAL, load_demonstrations, open_stage, starting_policy, train
+from _worlds import build
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
