@@ -15,9 +15,10 @@ TINY = [
     *("imitate.lr=1e-4", "self_examine.steps=20"),
 ]
 ONE_ROOM = [
-    *("GoToRedBallGrey", "GoToLocalS5N2", "PickupLoc", "PickupDist"),
-    *("PutNextLocalS5N3", "OneRoomS12", "FindObjS5", "OpenDoor", "GoToObjDoor"),
+    *("GoToLocalS5N2", "PickupLoc", "PickupDist", "PutNextLocalS5N3"),
+    *("FindObjS5", "OpenDoor", "GoToObjDoor"),
 ]
+ONE_MISSION = ["GoToRedBallGrey", "OneRoomS12"]
 
 
 def test_both_phases_run_in_babyai(compose, tmp_path):
@@ -94,3 +95,15 @@ def test_levels_of_one_room_start(compose, level):
     small = ["evaluate.episodes=8", "evaluate.audit_episodes=8", "self_examine.iterations=1"]
     results = two_phase(compose("two_phase", "world=babyai", f"level={level}", *TINY, *small))
     assert results["phase2"]["rate"]["count"] == 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", ONE_MISSION)
+def test_levels_of_one_mission_leave_nothing_to_choose(compose, level):
+    from two_phase import two_phase
+
+    options = compose("two_phase", "world=babyai", f"level={level}", *TINY, "evaluate.episodes=8")
+    with pytest.raises(UserError, match="different instructions"):
+        two_phase(options)
+    options.phase2 = False
+    assert two_phase(options)["phase1"]["rate"]["count"] == 8
