@@ -17,8 +17,9 @@ def train_goal(options: DictConfig) -> dict:
         return stage.result
     demos = load_demonstrations(stage.run)
     policy = starting_policy(stage.run, options, "goal")
+    context = options.goal.get("context", 0)
     loss = GoalLoss(
-        build(make_goal_judge, options, init_from=policy),
+        build(make_goal_judge, options, init_from=policy, context=context),
         demos.pool(),
         negatives=options.goal.negatives,
         removal_rate=options.goal.removal_rate,
