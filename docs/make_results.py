@@ -34,6 +34,9 @@ NAMES = {
     "phase2": "phase 2",
 }
 
+LEVELS = [("GoToObj", 1000), ("GoToLocal", 1000), ("PickupLoc", 1000), ("PutNextLocal", 1000)]
+"""Levels of BabyAI and numbers of demonstrations that the page speaks of, run or not."""
+
 Key = tuple[str, int, str]
 """Of a study: task, demonstrations, preset and variant."""
 
@@ -169,6 +172,43 @@ def imitation_section() -> list[str]:
     ]
 
 
+def babyai_section() -> list[str]:
+    """Return what was measured in the levels of BabyAI."""
+    found: dict[tuple[str, int], list[dict[str, Any]]] = {level: [] for level in LEVELS}
+    for path in sorted((ROOT / "results" / "babyai").glob("*.json")):
+        run = read_json(path)
+        level = (run["options"]["task"], run["options"]["demonstrations"]["n"])
+        found.setdefault(level, []).append(run)
+    ran = {(*level, ""): runs for level, runs in found.items() if runs}
+    return [
+        "## BabyAI",
+        "Greedy success by BabyAI's own reward in fixed rooms, in percent, with 95% intervals over"
+        " seeds and rooms. [How it is set up](babyai.md). `true actions` imitates what the bot did"
+        " in place of labels, which no learner may read: an upper reference for phase 1, as the bot"
+        " itself is.",
+        markdown_table([babyai_row(*level, runs) for level, runs in found.items()]),
+        *([commands(ran)] if ran else []),
+    ]
+
+
+def babyai_row(level: str, n: int, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Compare both phases in one level with their references."""
+    row: dict[str, Any] = {"level": level, "demonstrations": f"{n:,}", "seeds": len(runs)}
+    columns = {
+        "bot": "demonstrator",
+        "true actions": "true_actions",
+        "phase 1": "phase1",
+        "phase 2": "phase2",
+    }
+    for title, name in columns.items():
+        known = runs and all(name in run["results"] for run in runs)
+        row[title] = brief(two_level_bootstrap(outcomes(runs, name))) if known else "not run"
+    gained = row["phase 2"] != "not run"
+    both = [outcomes(runs, name) for name in ("phase1", "phase2")] if gained else []
+    row["gain, points"] = brief(paired_difference(*both)) if both else "not run"
+    return row
+
+
 def practised(variants: bool = False) -> dict[Key, list[dict[str, Any]]]:
     """Return the studies whose policy has practised: those of the presets, or their variants."""
     return {
@@ -253,7 +293,8 @@ def page(found: list[dict[str, Any]]) -> str:
         "Every number here comes from a file under `results/`, which holds all options, the seed,"
         " the commit and the machine. `python docs/make_results.py` writes this page from them.",
     ]
-    parts += study_section() + variant_section() + module_section() + imitation_section()
+    parts += study_section() + babyai_section()
+    parts += variant_section() + module_section() + imitation_section()
     for run in found:
         made = run["provenance"]
         parts += [

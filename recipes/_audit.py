@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-from _shared import CLASSIFIER, REWARD, load_demonstrations, load_network, world
+from _shared import CLASSIFIER, REWARD, load_demonstrations, load_network
+from _worlds import open_world
 from omegaconf import DictConfig
 from torch import nn
 
-from ifo_grounding.data import record_demonstrations
 from ifo_grounding.evaluation import (
     return_correlation,
     reward_audit,
@@ -26,19 +26,17 @@ def audit_callback(
     policy: nn.Module, reward: LearnedReward, run: Run, options: DictConfig
 ) -> Callable[[int], dict[str, float]]:
     """Return a callback that lets the oracle judge the policy, its instructions and its judges."""
-    shown = {
-        "seed": options.evaluate.seed,
-        "stream": "validation",
-        **world(options),
-    }
+    world = open_world(options)
+    scenes = {"seed": options.evaluate.seed, "stream": "validation"}
     episodes = options.evaluate.audit_episodes
+    place, shown = world.played(episodes, **scenes)
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
     pool = load_demonstrations(run).pool()
 
     def audit(step: int) -> dict[str, float]:
-        result = success_rate(policy, options.task, mode="both", episodes=episodes, **shown)
+        result = success_rate(policy, place, mode="both", **shown)
         assert result.sampled is not None
-        played = return_correlation(policy, reward, options.task, episodes=episodes, **shown)
+        played = return_correlation(policy, reward, place, **shown)
         return {
             "success": result.rate.rate,
             "success_low": result.rate.low,
@@ -48,8 +46,8 @@ def audit_callback(
             "audit_return": float(played.returns.mean()),
             "audit_success": played.success.rate,
             "judge_auc": played.auc.value,
-            **instructions(),
-            **actions(),
+            **(instructions() if world.oracle else {}),
+            **(actions() if world.oracle else {}),
         }
 
     # The instruction module and the saved judge do not change while the policy practises.
@@ -57,12 +55,12 @@ def audit_callback(
     def instructions() -> dict[str, float]:
         chosen = suitable_rate(
             classifier,
-            options.task,
+            world.task,
             pool,
             states=episodes,
             pairs_per_state=0,
             **{key: options.instruction[key] for key in ("threshold", "candidates", "choose")},
-            **shown,
+            **world.arguments(**scenes),
         )
         return {"suitable": chosen.rate.rate}
 
@@ -70,9 +68,7 @@ def audit_callback(
     def actions() -> dict[str, float]:
         if options.self_examine.kind == "goal":
             return {}
-        demos, truth = record_demonstrations(
-            options.task, EXPERT_EPISODES, keep_truth=True, **shown
-        )
+        demos, truth = world.demonstrate(EXPERT_EPISODES, **scenes)
         judge = load_network(run, REWARD, "train_reward", options)
         return {"action_auc": reward_audit(judge, demos, truth).auc.value}
 

@@ -1,4 +1,4 @@
-"""What every recipe needs: the run, the world, and configs from the options."""
+"""What every recipe needs: the run, its stages, and configs from the options."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from torchrl.data import ReplayBuffer
 
 from ifo_grounding import networks
 from ifo_grounding.data import Demonstrations, LabelReport
-from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.training.supervised import Validation
-from ifo_grounding.world import Layout
 
 torchrl_logger.setLevel("WARNING")
 
@@ -30,6 +28,7 @@ LABELS = "labels"
 INVERSE = "inverse.safetensors"
 POLICIES = ("policy-phase1.safetensors", "policy-phase2.safetensors")
 CONTROLS = ("policy-continued.safetensors", "policy-cloned.safetensors")
+REFERENCE = "reference-true-actions.safetensors"
 CLASSIFIER = "instruction.safetensors"
 REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
@@ -55,34 +54,6 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
 def shows_progress(options: DictConfig) -> bool:
     """Whether to show progress bars: if asked to, and if somebody can see them move."""
     return options.progress and sys.stderr.isatty()
-
-
-def world(options: DictConfig) -> dict[str, Any]:
-    """Return the arguments of the world that environments and the recorder share."""
-    chosen = plain(options.world)
-    layout: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in chosen.pop("layout").items()
-    }
-    return {**chosen, "layout": Layout(**layout)}
-
-
-def simulator(options: DictConfig, num_envs: int = 1, **kwargs: Any) -> PickAndPlaceEnv:
-    """Return the simulator without instructions and rewards: all that a learner may step."""
-    return PickAndPlaceEnv(
-        options.task,
-        num_envs=num_envs,
-        seed=options.seed,
-        device=options.device,
-        instructed=False,
-        **{**world(options), **kwargs},
-    )
-
-
-def build(make: Callable[..., Any], options: DictConfig, **kwargs: Any) -> Any:
-    """Build a network for the simulator's images, words and actions."""
-    chosen = {"seed": options.seed, "device": options.device, **kwargs}
-    return make(simulator(options), options.network, **chosen)
 
 
 def load_network(run: Run, name: str, recipe: str, options: DictConfig) -> Any:

@@ -1,6 +1,7 @@
 """Step the simulator at random: what the inverse module learns from (paper, 1st-phase)."""
 
-from _shared import RANDOM_STEPS, open_stage, shows_progress, simulator
+from _shared import RANDOM_STEPS, open_stage, shows_progress
+from _worlds import open_world
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
@@ -11,11 +12,12 @@ def collect(options: DictConfig) -> dict:
     stage = open_stage(options, "collect_transitions", ["transitions"], needs=[])
     if stage.result is not None:
         return stage.result
-    section = options.transitions
+    section, world = options.transitions, open_world(options)
     collected = collect_transitions(
-        simulator(options, section.num_envs),
+        world.simulator(section.num_envs),
         section.n,
         stop_probability=section.stop_probability,
+        stop_action=world.stop,
         drop_unchanged=section.drop_unchanged,
         seed=options.seed,
         progress=shows_progress(options),

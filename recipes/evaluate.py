@@ -13,14 +13,14 @@ from _shared import (
     load_demonstrations,
     load_network,
     open_stage,
-    world,
 )
+from _worlds import Grid, World, open_world
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.data import record_demonstrations
 from ifo_grounding.evaluation import (
     Endings,
+    SuccessResult,
     compare_endings,
     compare_success,
     episode_endings,
@@ -55,26 +55,20 @@ def evaluate(options: DictConfig) -> dict:
         for name, file in NAMES.items()
         if (run / file).exists()
     }
-    results |= evaluate_policies(policies, run, options)
-    results |= evaluate_endings(policies, options)
-    if options.evaluate.states and (run / CLASSIFIER).exists():
-        results["suitability"] = evaluate_choices(run, options)
-    results |= evaluate_judges(policies["phase1"], run, options)
+    world = open_world(options)
+    results |= evaluate_policies(policies, run, world)
+    if world.oracle:
+        results |= evaluate_endings(policies, world)
+        if options.evaluate.states and (run / CLASSIFIER).exists():
+            results["suitability"] = evaluate_choices(run, world)
+    results |= evaluate_judges(policies["phase1"], run, world)
     return stage.finish(results)
 
 
-def evaluate_policies(policies: dict[str, Any], run: Run, options: DictConfig) -> dict[str, Any]:
+def evaluate_policies(policies: dict[str, Any], run: Run, world: World) -> dict[str, Any]:
     """Measure success of each policy on the same fixed scenes, and the gain of phase 2."""
-    section = options.evaluate
-    shown = evaluation_scenes(options, section.episodes)
-    measured = {
-        name: success_rate(policy, options.task, mode=section.mode, **shown)
-        for name, policy in policies.items()
-    }
-    results = {
-        name: {**success.as_dict(), "outcomes": packed(success.outcomes)}
-        for name, success in measured.items()
-    }
+    measured = measured_success(policies, world)
+    results = success_results(measured)
     phases = [measured[name].outcomes for name in ("phase1", "phase2") if name in measured]
     torch.save(torch.stack(phases), run / "outcomes.pt")
     if "phase2" in measured:
@@ -82,16 +76,35 @@ def evaluate_policies(policies: dict[str, Any], run: Run, options: DictConfig) -
     return results
 
 
-def evaluate_endings(policies: dict[str, Any], options: DictConfig) -> dict[str, Any]:
+def measured_success(policies: dict[str, Any], world: World) -> dict[str, SuccessResult]:
+    """Measure success of each policy on the evaluation scenes."""
+    section = world.options.evaluate
+    place, shown = world.played(section.episodes, **evaluation_scenes(world.options))
+    return {
+        name: success_rate(policy, place, mode=section.mode, **shown)
+        for name, policy in policies.items()
+    }
+
+
+def success_results(measured: dict[str, SuccessResult]) -> dict[str, Any]:
+    """Return what was measured as plain values, with the success on every scene."""
+    return {
+        name: {**success.as_dict(), "outcomes": packed(success.outcomes)}
+        for name, success in measured.items()
+    }
+
+
+def evaluate_endings(policies: dict[str, Any], world: Grid) -> dict[str, Any]:
     """Say how the greedy episodes of each phase end, and what phase 2 changes.
 
     Of a zero-shot evaluation, the same of instructions that name trained pairs alone.
     """
-    shown = evaluation_scenes(options, options.evaluate.episodes)
+    shown = evaluation_scenes(world.options)
     phases = {name: policies[name] for name in ("phase1", "phase2") if name in policies}
 
     def endings(**scenes: Any) -> dict[str, Endings]:
-        return {n: episode_endings(p, options.task, **scenes) for n, p in phases.items()}
+        task, options = world.played(world.options.evaluate.episodes, **scenes)
+        return {n: episode_endings(p, task, **options) for n, p in phases.items()}
 
     found = endings(**shown)
     results: dict[str, Any] = {"endings": {name: end.as_dict() for name, end in found.items()}}
@@ -103,56 +116,46 @@ def evaluate_endings(policies: dict[str, Any], options: DictConfig) -> dict[str,
     return results
 
 
-def evaluate_choices(run: Run, options: DictConfig) -> dict[str, Any]:
+def evaluate_choices(run: Run, world: Grid) -> dict[str, Any]:
     """Let the oracle judge the instructions that the instruction module chooses."""
-    section = options.instruction
+    options, section = world.options, world.options.instruction
     result = suitable_rate(
         load_network(run, CLASSIFIER, "train_instruction", options),
-        options.task,
+        world.task,
         load_demonstrations(run).pool(),
         states=options.evaluate.states,
         threshold=section.threshold,
         candidates=section.candidates,
         choose=section.choose,
-        seed=options.evaluate.seed,
-        stream=options.evaluate.stream,
-        **evaluation_world(options),
+        **world.arguments(**evaluation_scenes(options)),
     )
     return result.as_dict()
 
 
-def evaluate_judges(policy: Any, run: Run, options: DictConfig) -> dict[str, Any]:
+def evaluate_judges(policy: Any, run: Run, world: World) -> dict[str, Any]:
     """Compare the judges with the expert's actions and with the true success of rollouts."""
     results: dict[str, Any] = {}
-    shown = evaluation_world(options)
-    audited = evaluation_scenes(options, options.evaluate.audit_episodes)
+    options = world.options
+    audited = evaluation_scenes(options)
+    place, shown = world.played(options.evaluate.audit_episodes, **audited)
     if (run / REWARD).exists():
         judge = load_network(run, REWARD, "train_reward", options)
-        demos, truth = record_demonstrations(
-            options.task, HELD_OUT, keep_truth=True, stream=options.evaluate.stream, **shown
-        )
-        results["action_reward"] = reward_audit(judge, demos, truth).as_dict()
-        audit = return_correlation(policy, judge, options.task, average=True, **audited)
+        if world.oracle:
+            others = {name: value for name, value in audited.items() if name != "seed"}
+            demos, truth = world.demonstrate(HELD_OUT, **others)
+            results["action_reward"] = reward_audit(judge, demos, truth).as_dict()
+        audit = return_correlation(policy, judge, place, average=True, **shown)
         results["action_return"] = audit.as_dict()
     if (run / GOAL).exists():
         judge = load_network(run, GOAL, "train_goal", options)
-        reward = LearnedReward(judge, "goal")
-        results["goal_return"] = return_correlation(
-            policy, reward, options.task, **audited
-        ).as_dict()
+        reward = LearnedReward(judge, "goal", stop_action=world.stop)
+        results["goal_return"] = return_correlation(policy, reward, place, **shown).as_dict()
     return results
 
 
-def evaluation_world(options: DictConfig) -> dict[str, Any]:
-    """Return the world's arguments with the split to evaluate on."""
-    return {**world(options), "split": options.evaluate.split}
-
-
-def evaluation_scenes(options: DictConfig, episodes: int) -> dict[str, Any]:
-    """Return which scenes to play, as the functions of `evaluation` take them."""
-    section = options.evaluate
-    chosen = {"episodes": episodes, "seed": section.seed, "stream": section.stream}
-    return {**chosen, **evaluation_world(options)}
+def evaluation_scenes(options: DictConfig) -> dict[str, Any]:
+    """Return which scenes to evaluate on."""
+    return {name: options.evaluate[name] for name in ("seed", "stream", "split")}
 
 
 @recipe_main

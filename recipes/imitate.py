@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 from _shared import (
     POLICIES,
-    build,
     fit_config,
     load_demonstrations,
     load_labels,
@@ -13,11 +12,13 @@ from _shared import (
     shows_progress,
     train,
 )
+from _worlds import build
 from omegaconf import DictConfig
+from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.data import labelled_buffer
+from ifo_grounding.data import Demonstrations, labelled_buffer
 from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.seeding import derive
@@ -30,6 +31,17 @@ def imitate(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     seen, held_out = labelled_demonstrations(stage.run, options.imitate.held_out)
+    return imitate_transitions(options, stage, seen, held_out, POLICIES[0])
+
+
+def imitate_transitions(
+    options: DictConfig,
+    stage: Stage,
+    seen: ReplayBuffer,
+    held_out: ReplayBuffer | None,
+    file: str,
+) -> dict:
+    """Imitate transitions with their actions, from the best of a few initial weights."""
     count = options.imitate.trials
     beginnings = [Beginning(options, stage, seen, held_out, n) for n in range(count)]
     best = min(beginnings, key=lambda beginning: beginning.try_out())
@@ -39,7 +51,7 @@ def imitate(options: DictConfig) -> dict:
         best.loss,
         seen,
         "imitate",
-        POLICIES[0],
+        file,
         held_out=best.validation,
         checkpoint=best.checkpoint,
         beginning=float(best.number),
@@ -95,7 +107,14 @@ class Beginning:
 
 def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, ReplayBuffer | None]:
     """Return the labelled transitions to learn from, and those of the share held out."""
-    demos, actions = load_demonstrations(run), load_labels(run).actions
+    demos = load_demonstrations(run)
+    return split_transitions(demos, load_labels(run).actions, share)
+
+
+def split_transitions(
+    demos: Demonstrations, actions: Tensor, share: float
+) -> tuple[ReplayBuffer, ReplayBuffer | None]:
+    """Return transitions with their actions to learn from, and those of the share held out."""
     seen = demos[: len(demos) - round(share * len(demos))]
     aside = demos[len(seen) :]
     split = seen.transitions

@@ -9,6 +9,7 @@ from _shared import (
     open_stage,
     shows_progress,
 )
+from _worlds import open_world
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
@@ -27,7 +28,7 @@ def label(options: DictConfig) -> dict:
     report.save(stage.run / LABELS)
     # Only the evaluation reads the truth: nothing of it goes back into training.
     truth = Truth.load(stage.run.need(TRUTH, "record_demonstrations"))
-    accuracy = label_accuracy(report.actions, truth)
+    accuracy = label_accuracy(report.actions, truth, names=open_world(options).actions)
     return stage.finish({"confidence": report.summary(), "accuracy": accuracy.as_dict()})
 
 

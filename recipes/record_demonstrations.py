@@ -1,23 +1,18 @@
-"""Record shortest-path demonstrations: frames and instructions, never actions."""
+"""Record demonstrations: frames and instructions, never actions."""
 
-from _shared import DEMONSTRATIONS, TRUTH, open_stage, shows_progress, world
+from _shared import DEMONSTRATIONS, TRUTH, open_stage, shows_progress
+from _worlds import open_world
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.data import record_demonstrations
 
 
 def record(options: DictConfig) -> dict:
     stage = open_stage(options, "record_demonstrations", ["demonstrations"], needs=[])
     if stage.result is not None:
         return stage.result
-    demos, truth = record_demonstrations(
-        options.task,
-        options.demonstrations.n,
-        seed=options.seed,
-        keep_truth=True,
-        progress=shows_progress(options),
-        **world(options),
+    demos, truth = open_world(options).demonstrate(
+        options.demonstrations.n, seed=options.seed, progress=shows_progress(options)
     )
     demos.save(stage.run / DEMONSTRATIONS)
     truth.save(stage.run / TRUTH)

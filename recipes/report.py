@@ -1,6 +1,5 @@
 """Write the report of a run: table, curves, chosen instructions and episodes, as one page."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,8 @@ from _shared import (
     load_network,
     open_run,
 )
-from evaluate import evaluate, evaluation_world
+from _worlds import World, open_world
+from evaluate import evaluate, evaluation_scenes
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 
@@ -55,17 +55,17 @@ EPISODES, TRACED = 4, 2
 def report(options: DictConfig) -> Path:
     run = open_run(options)
     results = evaluate(options)
-    pictures: dict[str, Any] = episode_pictures(run, options)
-    if (run / CLASSIFIER).exists():
+    world = open_world(options)
+    pictures: dict[str, Any] = episode_pictures(run, world)
+    if world.oracle and (run / CLASSIFIER).exists():
         pictures["Chosen instructions"] = instruction_cases(
             load_network(run, CLASSIFIER, "train_instruction", options),
-            options.task,
+            world.task,
             load_demonstrations(run).pool(),
             threshold=options.instruction.threshold,
             candidates=options.instruction.candidates,
             choose=options.instruction.choose,
-            stream="validation",
-            **evaluation_world(options),
+            **world.arguments(split=options.evaluate.split, stream="validation"),
         )
         pictures["How often random pairs are suitable, against what is said"] = reliability_diagram(
             [(said, restored(Rate, rate)) for said, rate in results["suitability"]["reliability"]]
@@ -81,22 +81,21 @@ def report(options: DictConfig) -> Path:
     )
 
 
-def episode_pictures(run: Run, options: DictConfig) -> dict[str, Any]:
+def episode_pictures(run: Run, world: World) -> dict[str, Any]:
     """Animate episodes: scenes that phase 2 gained and lost, or some of phase 1."""
     found: dict[str, Any] = {}
     policies = [
-        load_network(run, file, "imitate", options) for file in POLICIES if (run / file).exists()
+        load_network(run, file, "imitate", world.options)
+        for file in POLICIES
+        if (run / file).exists()
     ]
-    shown = {
-        "seed": options.evaluate.seed,
-        "stream": options.evaluate.stream,
-        "render_tile_size": 32,
-        **evaluation_world(options),
-    }
-    episodes = record_episodes(policies[-1], options.task, range(EPISODES), **shown)
-    found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES)
+    where = evaluation_scenes(world.options)
+    drawn: dict[str, Any] = {"actions": world.actions}
+    place, shown = world.pictured(list(range(EPISODES)), **where)
+    episodes = record_episodes(policies[-1], place, **shown)
+    found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES, **drawn)
     if len(policies) == 1:
-        return found | step_by_step(policies[0], range(TRACED), run, options)
+        return found | step_by_step(policies[0], list(range(TRACED)), run, world)
     before, after = torch.load(run / "outcomes.pt", weights_only=True)
     improved = (after & ~before).nonzero().squeeze(-1)[:TRACED].tolist()
     for title, changed in {
@@ -105,30 +104,29 @@ def episode_pictures(run: Run, options: DictConfig) -> dict[str, Any]:
     }.items():
         scenes = changed.nonzero().squeeze(-1)[:EPISODES].tolist()
         if scenes:
-            tries, titles = improved_episodes(
-                policies[0], policies[1], options.task, scenes, **shown
-            )
-            found[title] = animation(tries, titles=titles, columns=len(scenes))
-    return found | step_by_step(policies[1], improved or range(TRACED), run, options)
+            place, shown = world.pictured(scenes, **where)
+            tries, titles = improved_episodes(policies[0], policies[1], place, **shown)
+            found[title] = animation(tries, titles=titles, columns=len(scenes), **drawn)
+    return found | step_by_step(policies[1], improved or list(range(TRACED)), run, world)
 
 
 def step_by_step(
-    policy: TensorDictModule, scenes: Sequence[int], run: Run, options: DictConfig
+    policy: TensorDictModule, scenes: list[int], run: Run, world: World
 ) -> dict[str, bytes]:
     """Animate episodes with action probabilities, the judges' verdicts and attention."""
     judges = {
-        name: load_network(run, file, recipe, options)
+        name: load_network(run, file, recipe, world.options)
         for name, file, recipe in (("action", REWARD, "train_reward"), ("goal", GOAL, "train_goal"))
         if (run / file).exists()
     }
-    seed, stream = options.evaluate.seed, options.evaluate.stream
-    shown = {"seed": seed, "stream": stream, **evaluation_world(options)}
-    return {
-        f"Step by step, scene {episode.scene}": trace_animation(
-            trace_episode(policy, episode, judges)
-        )
-        for episode in record_episodes(policy, options.task, scenes, **shown)
-    }
+    place, shown = world.pictured(scenes, **evaluation_scenes(world.options))
+    words = load_demonstrations(run).vocabulary
+    found = {}
+    for episode in record_episodes(policy, place, **{**shown, "render_tile_size": None}):
+        trace = trace_episode(policy, episode, judges, vocabulary=words)
+        title = f"Step by step, scene {episode.scene}"
+        found[title] = trace_animation(trace, actions=world.actions)
+    return found
 
 
 def curves(run: Run) -> dict[str, Any]:

@@ -9,15 +9,14 @@ from _shared import (
     GOAL,
     POLICIES,
     REWARD,
-    build,
     load_demonstrations,
     load_labels,
     load_network,
     open_stage,
     self_examination_config,
     shows_progress,
-    simulator,
 )
+from _worlds import build, open_world
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig
 from torch import nn
@@ -81,8 +80,8 @@ def practice(
 ) -> tuple[TransformedEnv, LearnedReward, Adversary | None]:
     """Return the env to practise in, its reward and, where that is to be trained on, what does."""
     reward, adversary = learned_reward(run, options)
-    world = simulator(options, options.self_examine.num_envs)
-    env = TransformedEnv(world, Compose(chosen_starts(run, options), reward))
+    simulator = open_world(options).simulator(options.self_examine.num_envs)
+    env = TransformedEnv(simulator, Compose(chosen_starts(run, options), reward))
     return env, reward, adversary
 
 
@@ -106,6 +105,7 @@ def learned_reward(run: Run, options: DictConfig) -> tuple[LearnedReward, Advers
         section.kind,
         form=section.form,
         goal_model=rest[0] if rest else None,
+        stop_action=open_world(options).stop,
     )
     return reward, adversary
 
@@ -120,7 +120,7 @@ def chosen_starts(run: Run, options: DictConfig) -> InstructionSampler | Startin
         return InstructionSampler(classifier, pool, **chosen)
     with torch.no_grad():
         pairs = select_pairs(
-            simulator(options, options.self_examine.num_envs),
+            open_world(options).simulator(options.self_examine.num_envs),
             classifier,
             pool,
             options.self_examine.pairs,

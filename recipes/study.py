@@ -8,6 +8,7 @@ from _shared import open_run
 from controls import clone_accepted, continue_imitation
 from evaluate import evaluate
 from omegaconf import DictConfig
+from references import references
 from two_phase import train_phases
 
 from ifo_grounding.cli import recipe_main
@@ -23,6 +24,8 @@ def study(options: DictConfig) -> dict:
         continue_imitation(options)
         clone_accepted(options)
     results = evaluate(options)
+    if options.references:
+        results = {**results, **references(options)}
     content = write_result(options, results, "run study")
     if practised:
         content["audit"] = audit(options)

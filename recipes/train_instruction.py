@@ -2,12 +2,12 @@
 
 from _shared import (
     CLASSIFIER,
-    build,
     load_demonstrations,
     open_stage,
     starting_policy,
     train,
 )
+from _worlds import build
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main

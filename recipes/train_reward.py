@@ -1,6 +1,7 @@
 """Train the reward module: which actions are right (paper, 2nd-phase)."""
 
-from _shared import REWARD, build, load_demonstrations, load_labels, open_stage, train
+from _shared import REWARD, load_demonstrations, load_labels, open_stage, train
+from _worlds import build
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main

@@ -44,9 +44,9 @@ def train_phases(options: DictConfig) -> None:
         run.take_over(Run(options.base), without=PHASE_2)
     write_json(run / "options.json", plain(options))
     # Phase 1: imitation from observation.
+    record(options)  # first, for they hold the words of worlds with a vocabulary of their own
     collect(options)
     train_inverse(options)
-    record(options)
     label(options)
     imitate(options)
     if not options.phase2:

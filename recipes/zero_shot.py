@@ -11,7 +11,8 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from _results import keep_result, write_result
-from _shared import open_run, open_stage, simulator
+from _shared import open_run, open_stage
+from _worlds import open_world
 from collect_transitions import collect
 from evaluate import evaluation_scenes
 from imitate import Beginning, labelled_demonstrations
@@ -120,7 +121,8 @@ def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
 def beginning(name: str, options: DictConfig, seed: int) -> ImitationLoss:
     """Build a variant with the initial weights of a seed."""
     preset = "strong" if name == SENTENCE else "grounded"
-    loss = ImitationLoss(make_policy(simulator(options), preset, seed=seed, device=options.device))
+    world = open_world(options).simulator()
+    loss = ImitationLoss(make_policy(world, preset, seed=seed, device=options.device))
     if name in CHANGES:
         trunk = trunk_of(loss.network)
         assert isinstance(trunk, GroundedTrunk)
@@ -133,13 +135,15 @@ def beginning(name: str, options: DictConfig, seed: int) -> ImitationLoss:
 
 def measured(policy: nn.Module, options: DictConfig) -> dict[str, Any]:
     """Measure success on held-out and trained pairs, how episodes end, and the probes."""
-    shown = evaluation_scenes(options, options.evaluate.episodes)
+    world, section = open_world(options), options.evaluate
     results: dict[str, Any] = {}
     for name, split in (("held-out", "zero-shot"), ("trained", "train")):
-        ends = episode_endings(policy, options.task, **{**shown, "split": split})
+        scenes = {**evaluation_scenes(options), "split": split}
+        place, shown = world.played(section.episodes, **scenes)
+        ends = episode_endings(policy, place, **shown)
         won = wilson(ends.counts["success"], len(ends.kind))
         results[name] = {**ends.as_dict(), "rate": asdict(won), "outcomes": packed(ends.kind == 0)}
-    asked = {key: shown[key] for key in ("seed", "stream", "holdout")}
+    asked = {"seed": section.seed, "stream": section.stream, "holdout": options.world.holdout}
     results["probes"] = probe(policy, options.task, **asked).as_dict()
     return results
 

@@ -3,7 +3,7 @@
 import importlib.util
 from pathlib import Path
 
-from ifo_grounding.files import write_json
+from ifo_grounding.files import read_json, write_json
 from ifo_grounding.stats import wilson
 
 ROOT = Path(__file__).parents[1]
@@ -37,6 +37,7 @@ def test_every_result_says_where_it_comes_from():
     script = load_script()
     studied = [run for seeds in script.studies().values() for run in seeds]
     studied += [run for seeds in load_script("make_tables").pieces().values() for run in seeds]
+    studied += [read_json(path) for path in (ROOT / "results" / "babyai").glob("*.json")]
     for run in [*script.runs(), *studied]:
         commands = ("run study", "evaluate") if run in studied else ("demo",)
         assert any(run["command"].startswith(f"ifo-grounding {command}") for command in commands)
@@ -70,6 +71,29 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
     table = "\n".join(script.study_section())
     for shown in ("| pick | 2,000 | strong | 2 |", "50.0%", "75.0%", "+25.0", "+12.5", "not run"):
         assert shown in table
+
+
+def test_levels_of_babyai_are_compared_with_their_references(tmp_path, monkeypatch):
+    script = load_script()
+    folder = tmp_path / "results" / "babyai"
+    folder.mkdir(parents=True)
+    solved = {"phase1": "f0", "phase2": "fc", "true_actions": "f8", "demonstrator": "ff"}
+    results = {name: {"outcomes": bits, "rate": {"count": 8}} for name, bits in solved.items()}
+    run = {
+        "options": {"task": "GoToObj", "demonstrations": {"n": 1000}, "seed": 0},
+        "results": results,
+        "command": "ifo-grounding run study world=babyai",
+        "provenance": {"commit": "abc"},
+    }
+    write_json(folder / "0.json", run)
+    monkeypatch.setattr(script, "ROOT", tmp_path)
+    lines = "\n".join(script.babyai_section()).splitlines()
+    [ran] = [line for line in lines if line.startswith("| GoToObj |")]
+    assert all(f"| {rate}% [" in ran for rate in ("100.0", "62.5", "50.0", "75.0"))
+    assert "| +25.0 [" in ran and "not run" not in ran
+    [waiting] = [line for line in lines if line.startswith("| GoToLocal |")]
+    assert waiting.count("not run") == 5
+    assert "ifo-grounding run study world=babyai" in "\n".join(lines)
 
 
 def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):

@@ -1,12 +1,15 @@
+import numpy as np
 import pytest
 import torch
 
 pytest.importorskip("minigrid")
 
-from ifo_grounding.data import babyai, record_babyai
+from ifo_grounding.data import Truth, babyai, bot_outcomes, record_babyai
 from ifo_grounding.data.babyai import DONE
 from ifo_grounding.envs import from_gymnasium
+from ifo_grounding.envs.from_gymnasium import world_seed
 from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import derive
 
 
 def test_the_bot_is_recorded_without_actions():
@@ -47,6 +50,64 @@ def test_a_bot_s_steps_are_steps_of_the_environment():
     after = env.step(td.set("action", torch.tensor([0, DONE])))["next"]
     assert after["terminated"].flatten().tolist() == [False, True]
     assert (after["pixels"][0] != td["pixels"][0]).any()
+
+
+def test_true_actions_lead_from_frame_to_frame(tmp_path):
+    demos, truth = record_babyai("PutNextLocalS5N3", 3, seed=0, keep_truth=True)
+    truth.save(tmp_path / "truth")
+    truth = Truth.load(tmp_path / "truth")
+    assert truth.goals is None and len(truth.actions) == demos.transitions
+    taken = truth.actions.long().split((demos.lengths - 1).tolist())
+    for number, actions in enumerate(taken):
+        assert actions[-1] == DONE and (actions[:-1] != DONE).all()
+        room = babyai("PutNextLocalS5N3")()
+        seed = derive(0, "babyai", "PutNextLocalS5N3 training", number) % 2**31
+        seen = [room.reset(seed=seed)[0], *(room.step(a)[0] for a in actions.tolist())]
+        frames = np.stack([shown["image"].transpose(2, 0, 1) for shown in seen])
+        assert np.array_equal(frames, demos[number]["pixels"].numpy())
+
+
+def test_a_picture_is_minigrid_s_own_and_shows_what_is_carried():
+    room = babyai("PickupLoc", tile_size=16)()
+    level = room.unwrapped
+    seen = room.reset(seed=1)[0]["image"]
+    assert np.array_equal(seen, level.get_frame(highlight=False, tile_size=16))
+    assert room.observation_space["image"].contains(seen)
+    level.carrying = next(thing for thing in level.grid.grid if thing and thing.type != "wall")
+    seen, plain = room.step(0)[0]["image"], level.get_frame(highlight=False, tile_size=16)
+    assert (seen != plain).any(-1).nonzero()[0].max() < 16
+    assert np.array_equal(seen[16:], plain[16:]) and np.array_equal(seen[:, 16:], plain[:, 16:])
+
+
+def test_rooms_without_missions_go_on():
+    _, truth = record_babyai("GoToObj", 1, seed=0, keep_truth=True)
+    seed = derive(0, "babyai", "GoToObj training", 0) % 2**31
+    ends = {}
+    for missions in (True, False):
+        room = babyai("GoToObj", missions=missions)()
+        room.reset(seed=seed)
+        steps = [room.step(action) for action in truth.actions.tolist()[:-1]]
+        ends[missions] = [(reward > 0, terminated) for _, reward, terminated, _, _ in steps]
+    assert ends[True] == [*[(False, False)] * (len(steps) - 1), (True, True)]
+    assert not any(flag for end in ends[False] for flag in end)
+
+
+def test_the_bot_plays_the_rooms_of_the_environment():
+    outcomes = bot_outcomes("GoToObj", 3, seed=5)
+    assert outcomes.tolist() == [True] * 3
+    demos = record_babyai("GoToObj", 1, seed=0)
+    rooms = from_gymnasium(
+        babyai("GoToObj"),
+        vocabulary=demos.vocabulary,
+        num_envs=3,
+        skip_unknown=True,
+        seed=5,
+        stream="evaluation",
+    )
+    shown = rooms.reset()["pixels"].numpy()
+    for number in range(3):
+        first = babyai("GoToObj")().reset(seed=world_seed(5, "evaluation", number))[0]["image"]
+        assert np.array_equal(first.transpose(2, 0, 1), shown[number])
 
 
 def test_a_mission_of_unknown_words_names_them():

@@ -11,10 +11,10 @@ from torchrl.envs import TransformedEnv, check_env_specs
 from envs.dial import MARKS, PRESS, Dial
 from ifo_grounding.envs import from_gymnasium
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation import success_rate
+from ifo_grounding.evaluation import record_episodes, return_correlation, success_rate
 from ifo_grounding.networks import make_policy
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
-from ifo_grounding.transforms import InstructionSampler
+from ifo_grounding.transforms import InstructionSampler, LearnedReward
 
 WORDS = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS], length=6)
 DIAL = {"vocabulary": WORDS, "image": "view", "instruction": "task"}
@@ -142,7 +142,46 @@ def test_policies_and_evaluation_take_it_as_it_is():
     policy = make_policy(env, seed=0)
     result = success_rate(policy, env, episodes=20)
     assert result.rate.count == 20
-    assert result.scenes == success_rate(policy, dials(8), episodes=20).scenes
+    again = success_rate(policy, dials(5), episodes=20)
+    assert again.scenes == result.scenes  # numbered, however many stand side by side
+    assert torch.equal(again.outcomes, result.outcomes)
+
+
+def knows(td):
+    """Turn the dial to the mark of the instruction, and press."""
+    away = wanted(td) - shown(td["pixels"])
+    return td.set("action", torch.where(away == 0, PRESS, (away > 0).long()))
+
+
+def test_episodes_are_recorded_and_judged_as_they_are_counted():
+    half = lambda td: knows(td).set("action", torch.where(wanted(td) < 3, td["action"], PRESS))  # noqa: E731
+    result = success_rate(half, dials(7), episodes=14)
+    assert 0 < result.rate.rate < 1
+    episodes = record_episodes(half, dials(3), [11, 4, 12])
+    assert [e.success for e in episodes] == result.outcomes[[11, 4, 12]].tolist()
+    assert [len(e.actions) for e in episodes] == result.lengths[[11, 4, 12]].tolist()
+    for episode in episodes:
+        assert len(episode.frames) == len(episode.actions) + 1
+        assert episode.actions[-1] == PRESS and episode.sentence.startswith("turn the dial to")
+    with pytest.raises(UserError, match="3 rows for 2 scenes"):
+        record_episodes(half, dials(3), [0, 1])
+
+    def at_the_mark(pixels, instruction):
+        td = TensorDict({"pixels": pixels, "instruction": instruction})
+        return 16.0 * (shown(pixels) == wanted(td)).float().unsqueeze(-1) - 8.0
+
+    judge = TensorDictModule(at_the_mark, ["pixels", "instruction"], ["goal_score"])
+    reward = LearnedReward(judge, "goal", stop_action=PRESS)
+    audit = return_correlation(half, reward, dials(7), episodes=14, mode="greedy")
+    assert torch.equal(audit.outcomes, result.outcomes) and audit.auc.value == 1.0
+
+
+def test_words_that_nobody_taught_can_be_left_out():
+    known = Vocabulary.from_sentences(["turn the dial to one"], length=6)
+    with pytest.raises(UserError, match="unknown word"):
+        dials(6, vocabulary=known)
+    read = known.decode(dials(6, vocabulary=known, skip_unknown=True).reset()["instruction"])
+    assert "turn the dial to" in read and set(read) <= {"turn the dial to", "turn the dial to one"}
 
 
 def test_instructions_can_be_chosen_for_it():

@@ -1,6 +1,6 @@
 """Data: frames stored compactly, demonstrations without actions, transitions and labels."""
 
-from ifo_grounding.data.babyai import babyai, record_babyai
+from ifo_grounding.data.babyai import babyai, bot_outcomes, record_babyai
 from ifo_grounding.data.buffers import first_frame_buffer, goal_buffer
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
@@ -33,6 +33,7 @@ __all__ = [
     "TransitionReport",
     "Truth",
     "babyai",
+    "bot_outcomes",
     "collect_transitions",
     "first_frame_buffer",
     "goal_buffer",

@@ -4,39 +4,48 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, Literal, NamedTuple, overload
 
 import gymnasium
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.truth import Truth
+from ifo_grounding.envs.from_gymnasium import world_seed
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
-DONE = 6
-"""MiniGrid's action that does nothing: how a policy says that it is done."""
+BABYAI_ACTIONS = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
+"""MiniGrid's actions."""
+DONE = BABYAI_ACTIONS.index("done")
+"""The action that does nothing: how a policy says that it is done."""
 LENGTH = 32
 """Words of the longest mission of one room."""
 PATIENCE = 3
 """How many times as many episodes as asked for are played before the bot counts as unable."""
 
-Episode = tuple[np.ndarray, str]
+Make = Callable[[], gymnasium.Env]
 
 
-def babyai(level: str, tile_size: int = 8) -> Callable[[], gymnasium.Env]:
+def babyai(level: str, tile_size: int = 8, missions: bool = True) -> Make:
     """Return a function that makes a level of BabyAI whose whole room is seen as a picture.
+
+    What the agent carries is seen in the top left corner, so that a picture shows all there is.
 
     Args:
         level: such as ``GoToObj``, ``GoToLocal`` or ``PickupLoc``, or a full id.
         tile_size: pixels along one side of a cell.
+        missions: whether a room pays for its mission and ends with it. Without, it goes on: a
+            learner practises what it chooses itself.
 
     Raises:
         UserError: where minigrid is missing, or there is no such level.
@@ -49,35 +58,91 @@ def babyai(level: str, tile_size: int = 8) -> Callable[[], gymnasium.Env]:
     if name not in gymnasium.registry:
         known = sorted(i[7:-3] for i in gymnasium.registry if i.startswith("BabyAI-"))
         raise UserError(f"there is no level {name!r}: choose among {', '.join(known)}")
-    return functools.partial(_make, name, tile_size)
+    return functools.partial(_make, name, tile_size, missions)
 
 
-def _make(name: str, tile_size: int) -> gymnasium.Env:
+def _make(name: str, tile_size: int, missions: bool) -> gymnasium.Env:
     import minigrid  # noqa: F401
-    from minigrid.wrappers import RGBImgObsWrapper
 
-    return RGBImgObsWrapper(_Quiet(gymnasium.make(name)), tile_size=tile_size)
+    # The observation is another than the one declared, which the checker would refuse.
+    return _Room(gymnasium.make(name, disable_env_checker=True), tile_size, missions)
 
 
-class _Quiet(gymnasium.Wrapper):
-    """Keeps a level from printing whenever it draws a room anew."""
+class _Room(gymnasium.Wrapper):
+    """Shows a level's whole room, and keeps it from printing whenever it draws a room anew."""
+
+    def __init__(self, env: gymnasium.Env, tile_size: int, missions: bool) -> None:
+        super().__init__(env)
+        self.tile_size, self.missions = tile_size, missions
+        level: Any = env.unwrapped
+        # In place of what the agent sees, whose computation takes longer than all else.
+        level.gen_obs = self._look
+        self.level = level
+        size = (level.height * tile_size, level.width * tile_size, 3)
+        image = gymnasium.spaces.Box(0, 255, size, np.uint8)
+        mission = level.observation_space["mission"]
+        self.observation_space = gymnasium.spaces.Dict({"image": image, "mission": mission})
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in a new room."""
         with redirect_stdout(StringIO()):
             return self.env.reset(**options)
 
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take an action; without missions nothing but the room's time limit ends an episode."""
+        seen, reward, terminated, truncated, info = self.env.step(action)
+        if not self.missions:
+            reward, terminated = 0.0, False
+        return seen, float(reward), terminated, truncated, info
 
+    def _look(self) -> dict[str, Any]:
+        return {"image": self._picture(), "mission": self.level.mission}
+
+    def _picture(self) -> np.ndarray:
+        """Draw the room and what is carried, uint8 [H, W, 3]."""
+        grid, size = self.level.grid, self.tile_size
+        draw = functools.partial(grid.render_tile, tile_size=size)  # keeps what it has drawn
+        tiles = [draw(cell) for cell in grid.grid]
+        column, row = map(int, self.level.agent_pos)
+        here = row * grid.width + column
+        tiles[here] = draw(grid.grid[here], agent_dir=self.level.agent_dir)
+        if self.level.carrying is not None:
+            tiles[0] = draw(self.level.carrying)
+        cells = np.stack(tiles).astype(np.uint8).reshape(grid.height, grid.width, size, size, 3)
+        return cells.swapaxes(1, 2).reshape(grid.height * size, grid.width * size, 3)
+
+
+class _Played(NamedTuple):
+    """What the bot did in a room."""
+
+    frames: np.ndarray
+    """uint8 [T + 1, 3, H, W]; the last one is repeated."""
+    mission: str
+    """What it was asked for."""
+    actions: list[int]
+    """What it did, the stop included, [T]."""
+
+
+@overload
 def record_babyai(
+    level: str, n: int, *, keep_truth: Literal[False] = ..., **options: Any
+) -> Demonstrations: ...
+@overload
+def record_babyai(
+    level: str, n: int, *, keep_truth: Literal[True], **options: Any
+) -> tuple[Demonstrations, Truth]: ...
+def record_babyai(  # type: ignore[misc]  # the overloads leave options open
     level: str,
     n: int,
     *,
+    keep_truth: bool = False,
     seed: int = 0,
     stream: str = "training",
     tile_size: int = 8,
     processes: int = 1,
     vocabulary: Vocabulary | None = None,
     progress: bool = False,
-) -> Demonstrations:
+) -> Demonstrations | tuple[Demonstrations, Truth]:
     """Record BabyAI's bot: frames and missions, never actions.
 
     The bot's own end is followed by one repeated frame, the stop. Episodes that it does not solve
@@ -86,6 +151,7 @@ def record_babyai(
     Args:
         level: of BabyAI, see :func:`babyai`.
         n: number of demonstrations.
+        keep_truth: whether to return the bot's actions too, for evaluation only.
         seed: of the stream of rooms, which are other ones than those of
             :func:`~ifo_grounding.envs.from_gymnasium`.
         stream: name of the stream.
@@ -95,86 +161,117 @@ def record_babyai(
         progress: whether to show a bar.
 
     Returns:
-        Demonstrations of ``n`` episodes, closed.
+        Demonstrations of ``n`` episodes, closed; with ``keep_truth`` also a
+        :class:`~ifo_grounding.data.truth.Truth` without goals.
 
     Raises:
         UserError: where minigrid is missing, there is no such level, or the bot fails too often.
     """
     if n < 1 or processes < 1:
         raise UserError(f"n and processes must be at least 1, got {n} and {processes}")
-    play = functools.partial(_play, babyai(level, tile_size), seed, f"{level} {stream}")
-    frames: list[np.ndarray] = []
-    missions: list[str] = []
+    play = functools.partial(_play, babyai(level, tile_size))
+    name = f"{level} {stream}"
+    seeds = (derive(seed, "babyai", name, number) % 2**31 for number in range(PATIENCE * n))
+    found: list[_Played] = []
     with (
         tqdm(total=n, desc=f"record {level}", disable=not progress) as bar,
         _mapper(processes) as run,
     ):
-        for episode in run(play, range(PATIENCE * n)):
-            if episode is not None:
-                frames.append(episode[0])
-                missions.append(episode[1])
+        for played in run(play, seeds):
+            if played is not None:
+                found.append(played)
                 bar.update()
-            if len(frames) == n:
+            if len(found) == n:
                 break
-    if len(frames) < n:
+    if len(found) < n:
         raise UserError(
-            f"the bot solved {len(frames)} of {PATIENCE * n} episodes of {level}: choose a level "
+            f"the bot solved {len(found)} of {PATIENCE * n} episodes of {level}: choose a level "
             "that it can solve"
         )
+    missions = [played.mission for played in found]
     words = vocabulary or Vocabulary.from_sentences(missions, LENGTH)
-    shown = (torch.from_numpy(part) for part in frames)
-    return Demonstrations.from_arrays(shown, missions, vocabulary=words, tile_size=tile_size)
+    shown = (torch.from_numpy(played.frames) for played in found)
+    demos = Demonstrations.from_arrays(shown, missions, vocabulary=words, tile_size=tile_size)
+    if not keep_truth:
+        return demos
+    actions = itertools.chain.from_iterable(played.actions for played in found)
+    return demos, Truth(torch.tensor(list(actions), dtype=torch.uint8))
 
 
-class _mapper:
-    """``map`` over this process or several, in order and no further ahead than needed."""
+def bot_outcomes(
+    level: str,
+    episodes: int,
+    *,
+    seed: int = 0,
+    stream: str = "evaluation",
+    processes: int = 1,
+    progress: bool = False,
+) -> Tensor:
+    """Return whether BabyAI's bot fulfils its mission in each of the rooms of a stream, bool [N].
 
-    def __init__(self, processes: int) -> None:
-        # Fresh processes: forked ones would inherit torch's threads.
-        self.pool = (
-            ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
-            if processes > 1
-            else None
-        )
-        self.ahead = 16 * processes
+    The rooms are those that :func:`~ifo_grounding.envs.from_gymnasium` shows by their numbers, with
+    the same seed and stream.
 
-    def __enter__(self) -> Callable[..., Any]:
-        return self._run if self.pool else map
+    Args:
+        level: of BabyAI, see :func:`babyai`.
+        episodes: number of rooms.
+        seed: of the stream.
+        stream: ``training``, ``validation`` or ``evaluation``.
+        processes: how many play side by side.
+        progress: whether to show a bar.
+    """
+    seeds = (world_seed(seed, stream, number) for number in range(episodes))
+    play = functools.partial(_play, babyai(level))
+    bar = tqdm(total=episodes, desc=f"bot in {level}", disable=not progress)
+    solved = []
+    with bar, _mapper(processes) as run:
+        for played in run(play, seeds):
+            solved.append(played is not None)
+            bar.update()
+    return torch.tensor(solved)
 
-    def __exit__(self, *error: object) -> None:
-        if self.pool:
-            self.pool.shutdown(cancel_futures=True)
 
-    def _run(self, play: Callable[[int], Any], numbers: range) -> Any:
-        assert self.pool is not None
-        waiting = [self.pool.submit(play, number) for number in numbers[: self.ahead]]
-        for number in itertools.count(self.ahead):
-            if not waiting:
-                return
+@contextmanager
+def _mapper(processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
+    """Give ``map`` over this process or several, in order and no further ahead than needed."""
+    if processes == 1:
+        yield map
+        return
+    # Fresh processes: forked ones would inherit torch's threads.
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+
+    def run(play: Callable[[int], Any], seeds: Iterator[int]) -> Iterator[Any]:
+        waiting = [pool.submit(play, seed) for seed in itertools.islice(seeds, 16 * processes)]
+        while waiting:
             yield waiting.pop(0).result()
-            if number < len(numbers):
-                waiting.append(self.pool.submit(play, number))
+            waiting += [pool.submit(play, seed) for seed in itertools.islice(seeds, 1)]
+
+    try:
+        yield run
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def _play(make: Callable[[], gymnasium.Env], seed: int, stream: str, number: int) -> Episode | None:
+def _play(make: Make, seed: int) -> _Played | None:
     """Let the bot play a room; None where it does not succeed."""
     from minigrid.utils.baby_ai_bot import BabyAIBot
 
     env = make()
-    observation, _ = env.reset(seed=derive(seed, "babyai", stream, number) % 2**31)
-    mission = str(observation["mission"])
+    observation, _ = env.reset(seed=seed)
     bot = BabyAIBot(env.unwrapped)
-    frames, action = [observation["image"]], None
+    frames, actions, action = [observation["image"]], [], None
     while True:
         try:
             action = bot.replan(action)
         except Exception:  # some rooms are beyond it, and it says so in many ways
             return None
-        observation, reward, terminated, truncated, _ = env.step(action)
-        frames.append(observation["image"])
+        seen, reward, terminated, truncated, _ = env.step(action)
+        frames.append(seen["image"])
+        actions.append(int(action))
         if terminated or truncated:
             break
     if not reward:
         return None
     frames.append(frames[-1])  # the stop
-    return np.stack(frames).transpose(0, 3, 1, 2), mission
+    pictures = np.stack(frames).transpose(0, 3, 1, 2)
+    return _Played(pictures, str(observation["mission"]), [*actions, DONE])

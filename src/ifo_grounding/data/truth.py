@@ -29,21 +29,25 @@ class Truth:
 
     actions: Tensor
     """Action of each transition, in the order of ``Demonstrations.locate()``, uint8 [M]."""
-    goals: Goal
-    """What each demonstration was asked for, [N]."""
+    goals: Goal | None = None
+    """What each demonstration was asked for, [N]; None where only the grid's oracle could say."""
 
     def save(self, folder: str | Path) -> None:
         """Write a folder of its own."""
-        goals = {name: getattr(self.goals, name).to(torch.uint8) for name in FIELDS}
+        goals = {}
+        if self.goals is not None:
+            goals = {name: getattr(self.goals, name).to(torch.uint8) for name in FIELDS}
         save_folder(folder, KIND, VERSION, {"actions": self.actions, **goals}, {})
 
     @classmethod
     def load(cls, folder: str | Path) -> Truth:
         """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`."""
-        arrays, _ = load_folder(folder, KIND, VERSION, ("actions", *FIELDS))
+        arrays, _ = load_folder(folder, KIND, VERSION, ("actions",), FIELDS)
         actions = arrays.pop("actions")
+        if not arrays and actions.ndim == 1:
+            return cls(actions)
         shapes = {tuple(array.shape) for array in arrays.values()}
-        if len(shapes) != 1 or actions.ndim != 1:
+        if len(arrays) != len(FIELDS) or len(shapes) != 1 or actions.ndim != 1:
             raise UserError(f"{folder} is damaged: its arrays do not fit each other")
         goals = {name: array.long() for name, array in arrays.items()}
         return cls(actions, Goal(**goals, batch_size=shapes.pop()))

@@ -38,6 +38,7 @@ def from_gymnasium(
     instruction: str = "mission",
     instructed: bool = True,
     stop: int | str | None = None,
+    skip_unknown: bool = False,
     processes: bool = False,
     seed: int | None = None,
     stream: str = "training",
@@ -65,6 +66,8 @@ def from_gymnasium(
             ``"add"`` for one more action that never reaches the world. It terminates the episode;
             close the demonstrations with
             :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match.
+        skip_unknown: whether words that the vocabulary does not hold are left out of instructions;
+            otherwise they are refused.
         processes: whether every world runs in a process of its own.
         seed: of the stream of scenes; random by default.
         stream: ``training``, ``validation`` or ``evaluation``: disjoint scenes.
@@ -103,13 +106,18 @@ def from_gymnasium(
         make = world
     return GymnasiumEnv(
         make,
-        Reading(vocabulary, image, instruction, instructed, stop),
+        Reading(vocabulary, image, instruction, instructed, stop, skip_unknown),
         num_envs,
         processes=processes,
         seed=seed,
         stream=stream,
         device=device,
     )
+
+
+def world_seed(seed: int, stream: str, number: int) -> int:
+    """Return what a world is seeded with for the scene of a number."""
+    return derive(seed, stream, number) % 2**31
 
 
 class Reading:
@@ -121,6 +129,7 @@ class Reading:
         instruction: name of the sentence.
         instructed: whether instructions are read at all.
         stop: the action that ends an episode, ``"add"`` for one more, None where the world has one.
+        skip_unknown: whether unknown words of an instruction are left out.
     """
 
     def __init__(
@@ -130,11 +139,13 @@ class Reading:
         instruction: str,
         instructed: bool,
         stop: int | str | None = None,
+        skip_unknown: bool = False,
     ) -> None:
         if isinstance(stop, str):
             check_choice("stop", stop, (ADD,))
         self.vocabulary, self.image = vocabulary, image
         self.instruction, self.instructed, self.stop = instruction, instructed, stop
+        self.skip_unknown = skip_unknown
 
     def pixels(self, observation: Any) -> np.ndarray:
         """Return the image, uint8 [C, H, W]."""
@@ -231,7 +242,8 @@ class Read(gymnasium.Wrapper):
 
     def _encode(self, observation: Any, info: dict[str, Any]) -> np.ndarray:
         sentence = self.reading.sentence(observation, info)
-        return self.reading.vocabulary.encode(sentence)[0].numpy()
+        skip = self.reading.skip_unknown
+        return self.reading.vocabulary.encode(sentence, skip_unknown=skip)[0].numpy()
 
     def _seen(self, observation: Any, *ended: bool) -> dict[str, np.ndarray]:
         pixels = self.reading.pixels(observation)
@@ -317,7 +329,7 @@ class GymnasiumEnv(EnvBase):
             self._numbers[rows] = numbers
             seeds: list[int | None] = [None] * self.num_envs
             for row in rows.tolist():
-                seeds[row] = derive(self._seed, self.stream, int(self._numbers[row])) % 2**31
+                seeds[row] = world_seed(self._seed, self.stream, int(self._numbers[row]))
             seen, _ = self.worlds.reset(seed=seeds, options={"reset_mask": begins.numpy()})
             self._seen = seen
         return self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS})

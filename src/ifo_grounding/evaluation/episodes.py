@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
 from ifo_grounding import keys, modules
-from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import derive
 
@@ -86,8 +86,8 @@ def play(
     stopped = torch.zeros(rows, dtype=torch.bool, **on)
     active = torch.arange(rows, **on)
     state = start
-    # The world goes on after a stop, which spares new scenes for rows that nobody looks at.
-    runs_on = isinstance(env, PickAndPlaceEnv)
+    # These are stepped on after an end, which spares new scenes for rows that nobody looks at.
+    runs_on = isinstance(env, PickAndPlaceEnv | GymnasiumEnv)
     with set_exploration_type(MODES[mode]):
         for _ in range(max_steps):
             state[env.action_key] = _actions(policy, env, state, active)
@@ -154,9 +154,10 @@ def scene_batches(
     """Yield environments reset to the scenes with the given numbers, batch by batch.
 
     Args:
-        env_or_task: name of a task, or an instructed environment to use as it is. An environment
-            is seeded anew before each batch, so that its scenes depend on ``seed`` and nothing
-            else; its scenes have no numbers, and ``numbers`` only counts them.
+        env_or_task: name of a task, or an instructed environment to use as it is, seeded anew so
+            that its scenes depend on ``seed`` and nothing else. Those of
+            :func:`~ifo_grounding.envs.from_gymnasium` have numbers; of others, which are seeded
+            before each batch, ``numbers`` only counts the scenes.
         numbers: which scenes of the stream.
         seed: of the stream.
         stream: ``training``, ``validation`` or ``evaluation``.
@@ -167,18 +168,31 @@ def scene_batches(
     Yields:
         The environment, what its reset returned, and how many of its rows count.
     """
-    if not isinstance(env_or_task, str):
-        yield from _batches_of(env_or_task, len(numbers), seed, stream, env_options)
-        return
-    rows = min(batch_size, len(numbers))
-    env = PickAndPlaceEnv(
-        env_or_task, num_envs=rows, device=device, seed=seed, stream=stream, **env_options
-    )
-    wanted = torch.as_tensor(numbers, device=device)
+    env: EnvBase
+    if isinstance(env_or_task, str):
+        rows = min(batch_size, len(numbers))
+        env = PickAndPlaceEnv(
+            env_or_task, num_envs=rows, device=device, seed=seed, stream=stream, **env_options
+        )
+    else:
+        env, rows = env_or_task, env_or_task.batch_size.numel()
+        _check_given(env, env_options)
+        if not isinstance(env, GymnasiumEnv):
+            yield from _batches_of(env, len(numbers), seed, stream)
+            return
+        env.set_seed(seed)
+    yield from _numbered(env, rows, torch.as_tensor(numbers, device=device))
+
+
+def _numbered(
+    env: EnvBase, rows: int, wanted: Tensor
+) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
     for chosen in wanted.split(rows):
         # The last batch is filled up with copies of its first scene, which do not count.
         padded = torch.cat([chosen, chosen[:1].expand(rows - len(chosen))])
-        scene = TensorDict({keys.SCENE: padded.unsqueeze(-1)}, batch_size=[rows], device=device)
+        scene = TensorDict(
+            {keys.SCENE: padded.unsqueeze(-1)}, batch_size=[rows], device=wanted.device
+        )
         yield env, env.reset(scene), len(chosen)
 
 
@@ -210,9 +224,8 @@ def play_scenes(
     return [torch.cat(column) for column in zip(*parts, strict=True)], scenes.hexdigest()
 
 
-def _batches_of(
-    env: EnvBase, count: int, seed: int, stream: str, env_options: dict[str, Any]
-) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
+def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
+    """Refuse an environment that cannot be judged as asked for."""
     if env_options:
         raise UserError(
             f"options {sorted(env_options)} are for an environment made from a task's name: "
@@ -223,6 +236,11 @@ def _batches_of(
             "success needs an instructed environment: make it with instructed=True, or pass the "
             "name of a task"
         )
+
+
+def _batches_of(
+    env: EnvBase, count: int, seed: int, stream: str
+) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
     rows = env.batch_size.numel()
     for batch, first in enumerate(range(0, count, rows)):
         env.set_seed(derive(seed, stream, batch) % 2**31)

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import (
     MAX_STEPS,
     Policy,
@@ -23,7 +25,7 @@ from ifo_grounding.evaluation.episodes import (
 )
 from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive
-from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Episode:
 
 def record_episodes(
     policy: Policy,
-    task: str,
+    env_or_task: EnvBase | str,
     scenes: Sequence[int] = range(8),
     *,
     seed: int = 0,
@@ -64,14 +66,15 @@ def record_episodes(
 
     Args:
         policy: writes an action.
-        task: name of the task.
+        env_or_task: name of a task, or an instructed environment of
+            :func:`~ifo_grounding.envs.from_gymnasium` with as many rows as scenes are asked for.
         scenes: numbers of the scenes.
         seed: of the stream.
         stream: ``training``, ``validation`` or ``evaluation``.
         mode: ``greedy`` or ``sampled``.
         max_steps: most actions per episode.
-        render_tile_size: size of a cell in the kept frames, for people (16 or 32); what the policy
-            sees where None.
+        render_tile_size: size of a cell in the kept frames, for people (16 or 32), for a task's
+            name; what the policy sees where None.
         device: where to run; the policy's by default.
         env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
 
@@ -83,23 +86,34 @@ def record_episodes(
     if not len(scenes):
         return []
     where = torch.device(device) if device is not None else device_of(policy)
-    options = {"batch_size": len(scenes), "device": where, "max_steps": max_steps, **env_options}
-    env, start, _ = next(scene_batches(task, scenes, seed=seed, stream=stream, **options))
+    options = {"batch_size": len(scenes), "device": where, **env_options}
+    if isinstance(env_or_task, str):
+        options["max_steps"] = max_steps
+    env, start, _ = next(scene_batches(env_or_task, scenes, seed=seed, stream=stream, **options))
+    if env.batch_size.numel() != len(scenes):
+        raise UserError(
+            f"the environment has {env.batch_size.numel()} rows for {len(scenes)} scenes: make it "
+            "with as many"
+        )
 
-    def look() -> np.ndarray:
-        assert isinstance(env, PickAndPlaceEnv)
+    def look(shown: TensorDictBase) -> np.ndarray:
+        if not isinstance(env, PickAndPlaceEnv):
+            return shown[keys.PIXELS].cpu().numpy()
         tile_size = env.tile_size if render_tile_size is None else render_tile_size
         return env.render(tile_size).transpose(0, 3, 1, 2)
 
-    frames = [[frame] for frame in look()]
+    frames = [[frame] for frame in look(start)]
     actions: list[list[int]] = [[] for _ in scenes]
-    sentences = VOCABULARY.decode(start[keys.INSTRUCTION].cpu())
+    vocabulary: Vocabulary = getattr(env, "vocabulary", VOCABULARY)
+    sentences = vocabulary.decode(start[keys.INSTRUCTION].cpu())
 
     def keep(rows: Tensor, transition: TensorDictBase) -> None:
-        seen = look()
+        # The grid is drawn as a whole, at the size for people; of others, the rows that moved.
+        whole = isinstance(env, PickAndPlaceEnv)
+        seen = look(transition[keys.NEXT])
         taken = transition[keys.ACTION].tolist()
-        for row, action in zip(rows.tolist(), taken, strict=True):
-            frames[row].append(seen[row])
+        for place, (row, action) in enumerate(zip(rows.tolist(), taken, strict=True)):
+            frames[row].append(seen[row if whole else place])
             actions[row].append(action)
 
     with evaluating(policy), seeded(derive(seed, "record", mode), where):

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth
@@ -170,7 +171,7 @@ class ReturnAudit:
 def return_correlation(
     policy: Policy,
     reward: TensorDictModuleBase | LearnedReward,
-    task: str,
+    env_or_task: EnvBase | str,
     *,
     episodes: int = 1000,
     seed: int = 0,
@@ -191,7 +192,7 @@ def return_correlation(
         policy: whose episodes; sampled by default, so that some succeed and some fail.
         reward: what pays: a :class:`~ifo_grounding.transforms.LearnedReward`, or a module from
             (pixels, instruction, action) to a logit, taken as ``LearnedReward(reward)``.
-        task: name of the task.
+        env_or_task: name of a task, or an instructed batched environment with a true reward.
         episodes: number of scenes.
         seed: of scenes and actions.
         stream: ``training``, ``validation`` or ``evaluation``.
@@ -205,14 +206,15 @@ def return_correlation(
     """
     pay = reward if isinstance(reward, LearnedReward) else LearnedReward(reward)
     where = torch.device(device) if device is not None else device_of(policy)
+    if isinstance(env_or_task, str):
+        env_options["max_steps"] = max_steps
     batches = scene_batches(
-        task,
+        env_or_task,
         range(episodes),
         seed=seed,
         stream=stream,
         batch_size=batch_size,
         device=where,
-        max_steps=max_steps,
         **env_options,
     )
     paid, won = [], []

@@ -15,7 +15,7 @@ from ifo_grounding.evaluation.episodes import device_of
 from ifo_grounding.evaluation.recording import Episode
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks.attention import attention_maps
-from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ def trace_episode(
     policy: TensorDictModule,
     episode: Episode,
     judges: Mapping[str, TensorDictModule] | None = None,
+    *,
+    vocabulary: Vocabulary | None = None,
 ) -> Trace:
     """Ask a policy and judges about each step of an episode.
 
@@ -45,6 +47,7 @@ def trace_episode(
         episode: from :func:`record_episodes`, its frames as the policy sees them.
         judges: by name: reward modules, which judge the action that was taken, and goal judges,
             which say whether the instruction is fulfilled where the arm was then.
+        vocabulary: of the instruction; by default that of the library's own world.
 
     >>> from ifo_grounding.envs import PickAndPlaceEnv
     >>> from ifo_grounding.evaluation import record_episodes
@@ -57,12 +60,13 @@ def trace_episode(
     (6, (8, 6, 6), ['goal'])
     """
     steps, device = len(episode.actions), device_of(policy)
+    words = vocabulary or VOCABULARY
     frames = torch.from_numpy(episode.frames[:-1]).to(device)
     seen = TensorDict(
         {
             keys.PIXELS: frames,
             keys.INITIAL_PIXELS: frames[:1].expand_as(frames),
-            keys.INSTRUCTION: VOCABULARY.encode([episode.sentence]).to(device).expand(steps, -1),
+            keys.INSTRUCTION: words.encode([episode.sentence]).to(device).expand(steps, -1),
             keys.ACTION: torch.from_numpy(episode.actions).to(device),
         },
         batch_size=[steps],

@@ -22,6 +22,7 @@ def animation(
     episodes: Sequence[Episode],
     *,
     titles: Sequence[str] | None = None,
+    actions: Sequence[str] = keys.ACTIONS,
     columns: int = 4,
     width: int = 200,
     fps: float = 4.0,
@@ -35,6 +36,7 @@ def animation(
     Args:
         episodes: what to show, such as :func:`~ifo_grounding.evaluation.record_episodes` returns.
         titles: a word above each, such as ``phase 1``.
+        actions: names of the actions.
         columns: episodes side by side.
         width: about how wide an episode is drawn, in pixels; frames are enlarged without blur.
         fps: actions per second.
@@ -62,7 +64,9 @@ def animation(
     labels = titles or [""] * len(episodes)
     steps = max(len(episode.frames) for episode in episodes)
     pictures = [
-        sheet.draw([_cell(e, label, step) for e, label in zip(episodes, labels, strict=True)])
+        sheet.draw(
+            [_cell(e, label, step, actions) for e, label in zip(episodes, labels, strict=True)]
+        )
         for step in range(steps)
     ]
     return gif(pictures, fps, hold)
@@ -76,15 +80,11 @@ def save_animation(path: str | Path, episodes: Sequence[Episode], **options: obj
     return Path(path)
 
 
-def _cell(episode: Episode, title: str, step: int) -> Cell:
+def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Cell:
     last = len(episode.frames) - 1
     frame, ended = episode.frames[min(step, last)], step >= last
     if not ended:
-        note = (
-            f"step {step}"
-            if step == 0
-            else f"step {step}: {keys.ACTIONS[episode.actions[step - 1]]}"
-        )
+        note = f"step {step}" if step == 0 else f"step {step}: {actions[episode.actions[step - 1]]}"
         return Cell(frame, episode.sentence, title, note, RUNNING)
     ending = "success" if episode.success else "failure"
     note = f"{ending} after {last}" if episode.stopped else f"{ending}, never stopped"

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import Policy
@@ -123,7 +124,7 @@ def changed_scenes(
 def improved_episodes(
     first: Policy,
     second: Policy,
-    task: str,
+    env_or_task: EnvBase | str,
     scenes: Sequence[int],
     **options: Any,
 ) -> tuple[list[Episode], list[str]]:
@@ -132,7 +133,7 @@ def improved_episodes(
     Args:
         first: the policy of phase 1.
         second: the policy of phase 2.
-        task: name of the task.
+        env_or_task: where, as for :func:`~ifo_grounding.evaluation.record_episodes`.
         scenes: which, such as ``changed_scenes(before, after)[:4]``.
         options: of :func:`~ifo_grounding.evaluation.record_episodes`; ``seed`` and ``stream`` as
             for the results that the scenes come from.
@@ -141,6 +142,6 @@ def improved_episodes(
         Episodes, all of the first policy and then all of the second, and a title for each: with
         ``columns=len(scenes)`` both tries of a scene are in one column.
     """
-    tries = [record_episodes(policy, task, scenes, **options) for policy in (first, second)]
+    tries = [record_episodes(policy, env_or_task, scenes, **options) for policy in (first, second)]
     titles = [f"phase {phase}" for phase in (1, 2) for _ in scenes]
     return [*tries[0], *tries[1]], titles

@@ -12,6 +12,8 @@ from torch import Tensor
 from ifo_grounding.report.tables import text_table
 from ifo_grounding.stats import Difference, Estimate, Rate
 
+REFERENCES = {"true_actions": "imitation of true actions", "demonstrator": "demonstrator"}
+"""What no learner can or may be, by its name in the results."""
 Measured = TypeVar("Measured", Rate, Estimate, Difference)
 
 
@@ -46,6 +48,9 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
                 add(f"phase {phase} success, sampled", restored(Rate, sampled["rate"]))
     if gain := results.get("gain"):
         add("phase 2 - phase 1, paired, points", restored(Difference, gain))
+    for name, title in REFERENCES.items():
+        if success := results.get(name):
+            add(f"{title}, success (reference)", restored(Rate, success["rate"]))
     if choices := results.get("suitability"):
         add("suitable rate of chosen instructions", restored(Rate, choices["rate"]))
         add("states served", restored(Rate, choices["served"]))

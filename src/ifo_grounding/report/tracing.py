@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,7 +21,13 @@ MAPS = 8
 DPI = 80
 
 
-def trace_animation(trace: Trace, *, fps: float = 1.5, hold: float = 3.0) -> bytes:
+def trace_animation(
+    trace: Trace,
+    *,
+    actions: Sequence[str] = keys.ACTIONS,
+    fps: float = 1.5,
+    hold: float = 3.0,
+) -> bytes:
     """Return a GIF of an episode, step by step.
 
     Each picture has what the policy sees, the instruction, the probability of each action, what
@@ -28,11 +35,14 @@ def trace_animation(trace: Trace, *, fps: float = 1.5, hold: float = 3.0) -> byt
 
     Args:
         trace: from :func:`~ifo_grounding.evaluation.trace_episode`.
+        actions: names of the actions.
         fps: steps per second.
         hold: seconds for which the last step is shown.
     """
     chosen = sharpest(trace.maps, MAPS)
-    pictures = [_picture(step_figure(trace, step, chosen)) for step in range(len(trace.maps))]
+    pictures = [
+        _picture(step_figure(trace, step, chosen, actions)) for step in range(len(trace.maps))
+    ]
     return gif(pictures, fps, hold)
 
 
@@ -48,7 +58,7 @@ def sharpest(maps: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.argsort(-peak, kind="stable")[:count])
 
 
-def step_figure(trace: Trace, step: int, maps: np.ndarray) -> Figure:
+def step_figure(trace: Trace, step: int, maps: np.ndarray, actions: Sequence[str]) -> Figure:
     """Draw one step of an episode: what is seen, likely, judged and attended to."""
     episode = trace.episode
     figure, _ = _figure(7.6, 5.4)
@@ -56,8 +66,8 @@ def step_figure(trace: Trace, step: int, maps: np.ndarray) -> Figure:
     figure.suptitle(episode.sentence, fontsize=12, fontweight="bold", color=LIGHT["ink"])
     rows = figure.add_gridspec(2, 1, height_ratios=(3, 1.15))
     top = rows[0].subgridspec(1, 3 if trace.rewards else 2)
-    _seen(figure.add_subplot(top[0]), trace, step)
-    _actions(figure.add_subplot(top[1]), trace, step)
+    _seen(figure.add_subplot(top[0]), trace, step, actions)
+    _actions(figure.add_subplot(top[1]), trace, step, actions)
     if trace.rewards:
         _rewards(figure.add_subplot(top[2]), trace, step)
     below = rows[1].subgridspec(1, max(len(maps), 1))
@@ -66,9 +76,9 @@ def step_figure(trace: Trace, step: int, maps: np.ndarray) -> Figure:
     return figure
 
 
-def _seen(axes: Axes, trace: Trace, step: int) -> None:
+def _seen(axes: Axes, trace: Trace, step: int, actions: Sequence[str]) -> None:
     episode, last = trace.episode, len(trace.episode.actions) - 1
-    action = keys.ACTIONS[episode.actions[step]]
+    action = actions[episode.actions[step]]
     ending = ""
     if step == last:
         ending = ", success" if episode.success else ", failure"
@@ -76,10 +86,9 @@ def _seen(axes: Axes, trace: Trace, step: int) -> None:
     _image(axes, episode.frames[step])
 
 
-def _actions(axes: Axes, trace: Trace, step: int) -> None:
+def _actions(axes: Axes, trace: Trace, step: int, names: Sequence[str]) -> None:
     _dress(axes, "Probability of actions", grid="x")
     chosen = int(trace.episode.actions[step])
-    names = keys.ACTIONS
     colours = [PALETTE[0] if number == chosen else "#B6BEC7" for number in range(len(names))]
     axes.barh(range(len(names)), trace.probabilities[step], color=colours)
     axes.set_yticks(range(len(names)), names)

@@ -56,8 +56,12 @@ class Vocabulary:
         """Hash words and length."""
         return hash((self.words, self.length))
 
-    def encode(self, sentences: Sequence[str] | str) -> Tensor:
+    def encode(self, sentences: Sequence[str] | str, *, skip_unknown: bool = False) -> Tensor:
         """Turn sentences into token ids, int64 [N, length].
+
+        Args:
+            sentences: one or several.
+            skip_unknown: whether to leave unknown words out.
 
         Raises:
             UserError: where a word is unknown, or a sentence is empty or too long.
@@ -66,7 +70,10 @@ class Vocabulary:
             sentences = [sentences]
         tokens = torch.full((len(sentences), self.length), PAD, dtype=torch.int64)
         for row, sentence in enumerate(sentences):
-            ids = [self._id(word, sentence) for word in sentence.lower().split()]
+            words = sentence.lower().split()
+            if skip_unknown:
+                words = [word for word in words if word in self._ids]
+            ids = [self._id(word, sentence) for word in words]
             if not 0 < len(ids) <= self.length:
                 raise UserError(
                     f"{sentence!r} has {len(ids)} words: an instruction has 1 to {self.length}"

@@ -1,0 +1,153 @@
+"""The worlds that recipes run in; the option `simulator` names one, `world` holds its settings."""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from _shared import load_demonstrations, open_run, plain
+from omegaconf import DictConfig
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.data import (
+    Demonstrations,
+    Truth,
+    babyai,
+    bot_outcomes,
+    record_babyai,
+    record_demonstrations,
+)
+from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
+from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv, from_gymnasium
+from ifo_grounding.errors import check_choice
+from ifo_grounding.world import Layout
+
+ROOMS = 256
+"""Rooms of BabyAI that are played side by side."""
+UNTIL_THE_END = {"max_steps": 10_000}
+"""Rooms of BabyAI have time limits of their own."""
+Played = tuple[EnvBase | str, dict[str, Any]]
+"""Where to play instructed episodes, and how: arguments of the functions of `evaluation`."""
+
+
+class Grid:
+    """The library's own world, whose oracle knows what suits a scene and how an episode ended."""
+
+    actions = keys.ACTIONS
+    stop = keys.STOP
+    oracle = True
+
+    def __init__(self, options: DictConfig) -> None:
+        self.options, self.task = options, options.task
+
+    def arguments(self, **chosen: Any) -> dict[str, Any]:
+        """Return the arguments that environments, recorder and oracle share."""
+        settings = plain(self.options.world)
+        layout: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in settings.pop("layout").items()
+        }
+        return {**settings, "layout": Layout(**layout), **chosen}
+
+    def simulator(self, num_envs: int = 1) -> PickAndPlaceEnv:
+        """Return the simulator without instructions and rewards: all that a learner may step."""
+        return PickAndPlaceEnv(
+            self.task,
+            num_envs=num_envs,
+            seed=self.options.seed,
+            device=self.options.device,
+            instructed=False,
+            **self.arguments(),
+        )
+
+    def demonstrate(self, n: int, **chosen: Any) -> tuple[Demonstrations, Truth]:
+        """Record demonstrations, and apart from them what only evaluation may read."""
+        return record_demonstrations(self.task, n, keep_truth=True, **self.arguments(**chosen))
+
+    def played(self, episodes: int, **chosen: Any) -> Played:
+        """Return where to play instructed episodes."""
+        return self.task, {"episodes": episodes, **self.arguments(**chosen)}
+
+    def pictured(self, scenes: list[int], **chosen: Any) -> Played:
+        """Return where to record the episodes of scenes, to look at."""
+        return self.task, {"scenes": scenes, "render_tile_size": 32, **self.arguments(**chosen)}
+
+    def demonstrator(self, episodes: int, **chosen: Any) -> Tensor:
+        """Return the demonstrator's own success in these episodes: the expert never fails."""
+        return torch.ones(episodes, dtype=torch.bool)
+
+
+class BabyAI:
+    """A level of BabyAI (MiniGrid), whose bot demonstrates and whose own reward is success."""
+
+    actions = BABYAI_ACTIONS
+    stop = DONE
+    oracle = False
+
+    def __init__(self, options: DictConfig) -> None:
+        self.options, self.level = options, options.task
+        self.tile_size: int = options.world.tile_size
+        self.processes: int = options.processes or len(os.sched_getaffinity(0))
+
+    def simulator(self, num_envs: int = 1) -> GymnasiumEnv:
+        """Return rooms without missions: all that a learner may step."""
+        return self._rooms(num_envs, self.options.seed, "training", instructed=False)
+
+    def demonstrate(self, n: int, **chosen: Any) -> tuple[Demonstrations, Truth]:
+        """Let the bot demonstrate, and keep its actions apart."""
+        settings = {"tile_size": self.tile_size, "processes": self.processes, **chosen}
+        return record_babyai(self.level, n, keep_truth=True, **settings)
+
+    def played(
+        self, episodes: int, *, seed: int, stream: str, split: str = "all", **chosen: Any
+    ) -> Played:
+        """Return rooms with their missions."""
+        check_choice("evaluate.split of BabyAI", split, ["all"])
+        rooms = self._rooms(min(episodes, ROOMS), seed, stream)
+        return rooms, {"episodes": episodes, "seed": seed, "stream": stream, **UNTIL_THE_END}
+
+    def pictured(self, scenes: list[int], *, seed: int, stream: str, **chosen: Any) -> Played:
+        """Return where to record the episodes of rooms, to look at."""
+        rooms = self._rooms(len(scenes), seed, stream)
+        return rooms, {"scenes": scenes, "seed": seed, "stream": stream, **UNTIL_THE_END}
+
+    def demonstrator(self, episodes: int, *, seed: int, stream: str, **chosen: Any) -> Tensor:
+        """Return the bot's own success in these episodes."""
+        return bot_outcomes(
+            self.level, episodes, seed=seed, stream=stream, processes=self.processes, **chosen
+        )
+
+    def _rooms(
+        self, num_envs: int, seed: int, stream: str, instructed: bool = True
+    ) -> GymnasiumEnv:
+        words = load_demonstrations(open_run(self.options)).vocabulary
+        assert words is not None
+        return from_gymnasium(
+            babyai(self.level, self.tile_size, missions=instructed),
+            vocabulary=words,
+            num_envs=num_envs,
+            instructed=instructed,
+            stop=self.stop,
+            skip_unknown=True,  # no demonstration taught them
+            seed=seed,
+            stream=stream,
+            device=self.options.device,
+        )
+
+
+World = Grid | BabyAI
+WORLDS: dict[str, type[World]] = {"grid": Grid, "babyai": BabyAI}
+
+
+def open_world(options: DictConfig) -> World:
+    """Return the world of these options."""
+    check_choice("simulator", options.simulator, WORLDS)
+    return WORLDS[options.simulator](options)
+
+
+def build(make: Callable[..., Any], options: DictConfig, **kwargs: Any) -> Any:
+    """Build a network for the simulator's images, words and actions."""
+    chosen = {"seed": options.seed, "device": options.device, **kwargs}
+    return make(open_world(options).simulator(), options.network, **chosen)
