@@ -78,6 +78,15 @@ def small(folder):
     picture(folder / "b" / "1.png", 3, size=(8, 8))
 
 
+def all_small(folder):
+    for step in range(2):
+        picture(folder / "b" / f"{step}.png", 3, size=(8, 8))
+
+
+def deep(folder):
+    Image.fromarray(np.full((16, 24), 1000, np.uint16)).save(folder / "b" / "1.png")
+
+
 @pytest.mark.parametrize(
     ("how", "said"),
     [
@@ -93,7 +102,12 @@ def small(folder):
         (lambda f: write(f, [("a", "go", [0, 1]), ("c", "go", [])]), "episode 'c' has no frames"),
         (lambda f: [p.unlink() for p in (f / "b").iterdir()], "episode 'b' has no frames"),
         (lambda f: (f / "b" / "1.png").unlink(), "episode 'b' has 1 frame"),
-        (small, "episode 'b': 1.png has 8x8 pixels, those of episode 'a' have 24x16"),
+        (small, "episode 'b': 1.png has 8x8 pixels, the first frame has 24x16"),
+        (
+            all_small,
+            r"episode 'b' has images \[3, 8, 8\], the others have \[3, 16, 24\] .*'a'",
+        ),
+        (deep, "episode 'b': 1.png has numbers of mode 'I;16': save it with 8 bits"),
         (
             lambda f: (f / "b" / "1.png").write_bytes(b"no picture"),
             "episode 'b': .* cannot be read",

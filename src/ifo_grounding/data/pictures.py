@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from PIL import Image, ImageSequence, UnidentifiedImageError
 from tqdm import tqdm
 
+from ifo_grounding.data._reading import stack_pictures
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import atomic_write
@@ -24,7 +24,7 @@ MILLISECONDS = 250
 
 
 @dataclass(frozen=True)
-class Episode:
+class Listed:
     """A line of the list."""
 
     name: str
@@ -48,8 +48,8 @@ def load_pictures(
     that name with its frames, in the order of their names, or an animated picture of that name
     (``0001.gif``). A line may name another path as ``"frames"``.
 
-    Frames are read one episode after the other and stored compactly: the pixels of all episodes
-    are never in memory together, unless no tile repeats.
+    Frames are read one episode after the other: the pixels of all episodes are never in memory
+    together.
 
     Args:
         folder: where from.
@@ -62,24 +62,16 @@ def load_pictures(
         UserError: naming the episode, where a line, a frame or an instruction is not as it has to
             be.
     """
-    folder = Path(folder)
-    episodes = read_list(folder)
-    sentences = [episode.instruction for episode in episodes]
-    words = vocabulary or Vocabulary.from_sentences(
-        sentences, max(len(s.split()) for s in sentences)
+    shown = (
+        (one.name, stack_pictures(one.name, _pictures(one)), one.instruction)
+        for one in tqdm(read_list(Path(folder)), desc="read", disable=not progress)
     )
-    for episode in episodes:
-        try:
-            words.encode(episode.instruction)
-        except UserError as error:
-            raise UserError(f"episode {episode.name!r}: {error}") from None
-    demos = Demonstrations.from_arrays(
-        _frames(episodes, progress), sentences, vocabulary=words, tile_size=tile_size
+    return Demonstrations.from_episodes(
+        shown, vocabulary=vocabulary, tile_size=tile_size, close=close
     )
-    return demos.close_episodes() if close else demos
 
 
-def read_list(folder: Path) -> list[Episode]:
+def read_list(folder: Path) -> list[Listed]:
     """Read the list of a folder's episodes.
 
     Raises:
@@ -91,7 +83,7 @@ def read_list(folder: Path) -> list[Episode]:
             f"{path} does not exist: write one line per episode, such as "
             '{"episode": "0001", "instruction": "go to the red ball"}'
         )
-    episodes: list[Episode] = []
+    episodes: list[Listed] = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         if not line.strip():
             continue
@@ -104,7 +96,7 @@ def read_list(folder: Path) -> list[Episode]:
             ) from None
         if not instruction:
             raise UserError(f"episode {name!r} has no instruction ({path}, line {number})")
-        episodes.append(Episode(name, instruction, _where(folder, name, entry.get("frames"))))
+        episodes.append(Listed(name, instruction, _where(folder, name, entry.get("frames"))))
     if not episodes:
         raise UserError(f"{path} lists no episode")
     name, times = Counter(episode.name for episode in episodes).most_common(1)[0]
@@ -125,29 +117,8 @@ def _where(folder: Path, name: str, given: object) -> Path:
     return path
 
 
-def _frames(episodes: list[Episode], progress: bool) -> Iterator[np.ndarray]:
-    """Yield the frames of each episode, uint8 [T + 1, 3, H, W]."""
-    first: tuple[str, tuple[int, int]] | None = None
-    for episode in tqdm(episodes, desc="read", disable=not progress):
-        frames = []
-        for place, picture in _pictures(episode):
-            first = first or (episode.name, picture.size)
-            if picture.size != first[1]:
-                raise UserError(
-                    f"episode {episode.name!r}: {place} has {_size(picture.size)} pixels, those of "
-                    f"episode {first[0]!r} have {_size(first[1])}: scale them to one size"
-                )
-            frames.append(np.asarray(picture))
-        if len(frames) < 2:
-            raise UserError(
-                f"episode {episode.name!r} has {len(frames)} frame: a demonstration shows at least "
-                "one step, which takes two"
-            )
-        yield np.stack(frames).transpose(0, 3, 1, 2)
-
-
-def _pictures(episode: Episode) -> Iterator[tuple[str, Image.Image]]:
-    """Yield name and RGB picture of each frame."""
+def _pictures(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
+    """Yield name and picture of each frame."""
     if episode.path.is_dir():
         paths = sorted(p for p in episode.path.iterdir() if p.suffix.lower() in FILES)
         if not paths:
@@ -162,13 +133,9 @@ def _pictures(episode: Episode) -> Iterator[tuple[str, Image.Image]]:
             with Image.open(path) as opened:
                 for number, frame in enumerate(ImageSequence.Iterator(opened)):
                     name = path.name if episode.path.is_dir() else f"{path.name}, frame {number}"
-                    yield name, frame.convert("RGB")
+                    yield name, frame
         except (UnidentifiedImageError, OSError, SyntaxError) as error:
             raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
-
-
-def _size(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
 
 
 def save_pictures(
