@@ -1,4 +1,4 @@
-"""Demonstrations from and to pictures: a list of instructions, and frames of each episode."""
+"""Demonstrations from and to pictures and videos: a list of instructions, and frames of each."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, ImageSequence, UnidentifiedImageError
+from torch import Tensor
 from tqdm import tqdm
 
-from ifo_grounding.data._reading import stack_pictures
+from ifo_grounding.data._reading import COLOURS, naming, stack_pictures
+from ifo_grounding.data._video import read_video, write_video
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import atomic_write
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 LIST = "episodes.jsonl"
-FORMATS = ("png", "gif")
+FORMATS = ("png", "gif", "mp4")
+VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm"}
 FILES = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
 MILLISECONDS = 250
 
@@ -30,7 +34,7 @@ class Listed:
     name: str
     instruction: str
     path: Path
-    """Folder of pictures, in the order of their names, or one animated picture."""
+    """Folder of pictures, in the order of their names, one animated picture, or a video."""
 
 
 def load_pictures(
@@ -45,11 +49,13 @@ def load_pictures(
 
     The folder holds ``episodes.jsonl`` with one line per episode, such as
     ``{"episode": "0001", "instruction": "go to the red ball"}``, and for each of them a folder of
-    that name with its frames, in the order of their names, or an animated picture of that name
-    (``0001.gif``). A line may name another path as ``"frames"``.
+    that name with its frames, in the order of their names, an animated picture of that name
+    (``0001.gif``) or a video (``0001.mp4``, with the extra ``video``). A line may name another path
+    as ``"frames"``.
 
     Frames are read one episode after the other: the pixels of all episodes are never in memory
-    together.
+    together. A video is lossy: its frames are those that a player shows, not those that were
+    recorded, and a repeated last frame may come back a little different.
 
     Args:
         folder: where from.
@@ -109,9 +115,8 @@ def _where(folder: Path, name: str, given: object) -> Path:
     if given is not None:
         path = folder / str(given)
     else:
-        path = next(
-            (p for p in (folder / name, folder / f"{name}.gif") if p.exists()), folder / name
-        )
+        paths = [folder / f"{name}{suffix}" for suffix in ("", ".gif", *sorted(VIDEOS))]
+        path = next((path for path in paths if path.exists()), paths[0])
     if not path.exists():
         raise UserError(f"episode {name!r} has no frames: {path} does not exist")
     return path
@@ -126,6 +131,11 @@ def _pictures(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
                 f"episode {episode.name!r} has no frames: {episode.path} holds none of "
                 + ", ".join(sorted(FILES))
             )
+    elif episode.path.suffix.lower() in VIDEOS:
+        with naming(episode.name):
+            for number, frame in enumerate(read_video(episode.path)):
+                yield f"{episode.path.name}, frame {number}", frame
+        return
     else:
         paths = [episode.path]
     for path in paths:
@@ -146,12 +156,13 @@ def save_pictures(
     Args:
         demos: with a vocabulary.
         folder: where to; it appears when everything is written, and :func:`load_pictures` reads it.
-        kind: ``png``, a folder of frames per episode, or ``gif``, an animation of each. A GIF holds
-            256 colours a frame: pictures with more come back changed.
+        kind: ``png``, a folder of frames per episode; ``gif``, an animation of each; or ``mp4``, a
+            video of each, with the extra ``video``. A GIF holds 256 colours a frame, and a video is
+            lossy: to keep frames as they are, take ``png``.
         scale: by which every pixel is enlarged.
 
     Raises:
-        UserError: where there is no vocabulary, or an unknown kind.
+        UserError: where there is no vocabulary, the kind is unknown, or images do not fit it.
     """
     check_choice("kind", kind, FORMATS)
     if scale < 1:
@@ -164,8 +175,11 @@ def save_pictures(
         for number, sentence in enumerate(sentences):
             name = f"{number:0{digits}d}"
             lines.append(json.dumps({"episode": name, "instruction": sentence}))
-            frames = demos[number]["pixels"].permute(0, 2, 3, 1).numpy()
-            pictures = [_enlarged(Image.fromarray(frame), scale) for frame in frames]
+            frames = rgb(demos[number]["pixels"]).repeat(scale, 1).repeat(scale, 2)
+            if kind == "mp4":
+                write_video(temporary / f"{name}.mp4", frames, fps=1000 / MILLISECONDS)
+                continue
+            pictures = [Image.fromarray(frame) for frame in frames]
             if kind == "gif":
                 pictures[0].save(
                     temporary / f"{name}.gif",
@@ -181,6 +195,8 @@ def save_pictures(
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _enlarged(picture: Image.Image, scale: int) -> Image.Image:
-    size = (picture.width * scale, picture.height * scale)
-    return picture if scale == 1 else picture.resize(size, Image.Resampling.NEAREST)
+def rgb(pixels: Tensor) -> np.ndarray:
+    """Return frames [*B, C, H, W] of one or three colours as pictures, uint8 [*B, H, W, 3]."""
+    if pixels.shape[-3] not in COLOURS:
+        raise UserError(f"pictures have 1 or 3 colours, these frames have {pixels.shape[-3]}")
+    return pixels.expand(*pixels.shape[:-3], 3, -1, -1).movedim(-3, -1).contiguous().numpy()
