@@ -143,6 +143,13 @@ def all_small(folder):
         picture(folder / "b" / f"{step}.png", 3, size=(8, 8))
 
 
+def cut(folder):
+    path = folder / "b" / "1.png"
+    noise = np.random.default_rng(0).integers(256, size=(16, 24, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(path)
+    path.write_bytes(path.read_bytes()[:700])
+
+
 def deep(folder):
     Image.fromarray(np.full((16, 24), 1000, np.uint16)).save(folder / "b" / "1.png")
 
@@ -167,6 +174,7 @@ def deep(folder):
             all_small,
             r"episode 'b' has images \[3, 8, 8\], the others have \[3, 16, 24\] .*'a'",
         ),
+        (cut, r"episode 'b': 1\.png cannot be read \(image file is truncated"),
         (deep, "episode 'b': 1.png has numbers of mode 'I;16': save it with 8 bits"),
         (
             lambda f: (f / "b" / "1.png").write_bytes(b"no picture"),

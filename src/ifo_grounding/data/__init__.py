@@ -5,6 +5,7 @@ from ifo_grounding.data.buffers import first_frame_buffer, goal_buffer
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.huggingface import from_huggingface, to_huggingface
 from ifo_grounding.data.labelling import (
     Labelled,
     LabelReport,
@@ -35,6 +36,7 @@ __all__ = [
     "babyai",
     "collect_transitions",
     "first_frame_buffer",
+    "from_huggingface",
     "goal_buffer",
     "label_demonstrations",
     "labelled_buffer",
@@ -42,4 +44,5 @@ __all__ = [
     "record_babyai",
     "record_demonstrations",
     "save_pictures",
+    "to_huggingface",
 ]

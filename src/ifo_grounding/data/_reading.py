@@ -142,7 +142,10 @@ def stack_pictures(name: Name, pictures: Iterable[tuple[str, Image.Image]]) -> n
                 f"episode {name!r}: {place} has numbers of mode {picture.mode!r}: save it with 8 "
                 "bits per colour"
             )
-        frames.append(np.asarray(picture.convert("RGB")))
+        try:
+            frames.append(np.asarray(picture.convert("RGB")))
+        except (OSError, SyntaxError) as error:
+            raise UserError(f"episode {name!r}: {place} cannot be read ({error})") from None
         if frames[-1].shape != frames[0].shape:
             raise UserError(
                 f"episode {name!r}: {place} has {_size(frames[-1])} pixels, the first frame has "

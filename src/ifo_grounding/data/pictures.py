@@ -168,6 +168,7 @@ def save_pictures(
     if scale < 1:
         raise UserError(f"scale must be at least 1, got {scale}")
     sentences = demos.sentences()
+    check_colours(demos)
     digits = len(str(len(demos) - 1))
     with atomic_write(folder) as temporary:
         temporary.mkdir()
@@ -195,8 +196,12 @@ def save_pictures(
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def check_colours(demos: Demonstrations) -> None:
+    """Refuse frames that are no pictures."""
+    if demos.image_shape[0] not in COLOURS:
+        raise UserError(f"pictures have 1 or 3 colours, these frames have {demos.image_shape[0]}")
+
+
 def rgb(pixels: Tensor) -> np.ndarray:
     """Return frames [*B, C, H, W] of one or three colours as pictures, uint8 [*B, H, W, 3]."""
-    if pixels.shape[-3] not in COLOURS:
-        raise UserError(f"pictures have 1 or 3 colours, these frames have {pixels.shape[-3]}")
     return pixels.expand(*pixels.shape[:-3], 3, -1, -1).movedim(-3, -1).contiguous().numpy()
