@@ -12,6 +12,7 @@ from ifo_grounding.data.labelling import (
     label_demonstrations,
     labelled_buffer,
 )
+from ifo_grounding.data.minari import from_minari, to_minari
 from ifo_grounding.data.pictures import load_pictures, save_pictures
 from ifo_grounding.data.recording import record_demonstrations
 from ifo_grounding.data.transitions import (
@@ -37,6 +38,7 @@ __all__ = [
     "collect_transitions",
     "first_frame_buffer",
     "from_huggingface",
+    "from_minari",
     "goal_buffer",
     "label_demonstrations",
     "labelled_buffer",
@@ -45,4 +47,5 @@ __all__ = [
     "record_demonstrations",
     "save_pictures",
     "to_huggingface",
+    "to_minari",
 ]
