@@ -300,6 +300,13 @@ def test_what_is_wrong_with_an_episode_is_said_with_its_name(frames, sentence, s
         Demonstrations.from_episodes(given, vocabulary=Vocabulary(["go"]))
 
 
+def test_arrays_may_be_views():
+    drawn = np.random.default_rng(0).integers(256, size=(3, 16, 24, 3), dtype=np.uint8)
+    rgb = drawn[..., ::-1].transpose(0, 3, 1, 2)  # as OpenCV's pictures are turned into RGB
+    demos = Demonstrations.from_episodes([("a", rgb, "go")], close=False)
+    assert np.array_equal(demos[0]["pixels"].numpy(), rgb)
+
+
 def test_no_episode_at_all_is_refused():
     with pytest.raises(UserError, match="there is no episode"):
         Demonstrations.from_episodes([])

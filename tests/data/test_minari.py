@@ -1,17 +1,17 @@
 import shutil
 
-import h5py
-import minari
 import numpy as np
 import pyarrow.parquet
 import pytest
 import torch
 from gymnasium import spaces
-from minari.data_collector import EpisodeBuffer
 
 from ifo_grounding.data import Demonstrations, from_minari, record_demonstrations, to_minari
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY
+
+minari = pytest.importorskip("minari", reason="the extra minari needs Python 3.11")
+h5py = pytest.importorskip("h5py")
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*None")
 BOX = spaces.Box(0, 255, (40, 48, 3), np.uint8)
@@ -66,7 +66,7 @@ def another(name, n=4, space=None, make=None, **storing):
     draw = np.random.default_rng(0)
     views = [draw.integers(256, size=(3 + k, *BOX.shape), dtype=np.uint8) for k in range(n)]
     buffers = [
-        EpisodeBuffer(
+        minari.data_collector.EpisodeBuffer(
             observations=make(shown, number),
             actions=np.arange(1, len(shown)),
             rewards=[1.0] * (len(shown) - 1),

@@ -99,7 +99,9 @@ def check_frames(name: Name, given: Tensor | np.ndarray) -> Tensor:
             be seen: colours last and alpha channels are refused.
     """
     try:
-        frames = given if isinstance(given, Tensor) else torch.as_tensor(np.asarray(given))
+        frames = (
+            given if isinstance(given, Tensor) else torch.as_tensor(np.ascontiguousarray(given))
+        )
     except (TypeError, ValueError, RuntimeError):
         raise UserError(f"episode {name!r}: its frames are not arrays of one size") from None
     shape = list(frames.shape)
