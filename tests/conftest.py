@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import random
 
-# Before matplotlib and pygame are imported anywhere: no test needs a screen.
+# Before these are imported anywhere: no test needs a screen or the network.
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 import numpy as np
 import pytest
@@ -28,4 +29,5 @@ def ifo_home(tmp_path_factory, monkeypatch):
     """Folder that stands for the user's IFO_GROUNDING_HOME during one test."""
     folder = tmp_path_factory.mktemp("home")
     monkeypatch.setenv("IFO_GROUNDING_HOME", str(folder))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
     return folder

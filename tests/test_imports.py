@@ -133,3 +133,10 @@ def test_keys_are_distinct_and_documented():
 def test_the_command_starts_without_torch():
     code = "import sys, ifo_grounding.cli; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_extras_are_imported_only_when_they_are_used():
+    extras = ("av", "datasets", "h5py", "huggingface_hub", "imageio", "minari", "pyarrow", "pygame")
+    code = f"import sys, ifo_grounding.data; sys.exit(str({set(extras)} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.stderr.strip() == "set()"

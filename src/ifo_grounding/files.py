@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import shutil
+import tempfile
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,14 @@ from ifo_grounding.errors import UserError
 def home() -> Path:
     """Folder of runs and data: ``$IFO_GROUNDING_HOME``, or ``~/.cache/ifo-grounding``."""
     return Path(os.environ.get("IFO_GROUNDING_HOME", "~/.cache/ifo-grounding")).expanduser()
+
+
+def scratch_file() -> Path:
+    """Make an empty file in :func:`home`, for more than fits into memory; its maker removes it."""
+    home().mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix="scratch-", dir=home())
+    os.close(handle)
+    return Path(name)
 
 
 @contextlib.contextmanager

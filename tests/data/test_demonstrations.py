@@ -191,7 +191,12 @@ def test_many_short_episodes_are_read_in_pieces():
 
 
 def test_there_is_no_place_for_actions(demos):
-    for call in (Demonstrations, Demonstrations.from_arrays, Demonstrations.load):
+    for call in (
+        Demonstrations,
+        Demonstrations.from_arrays,
+        Demonstrations.from_episodes,
+        Demonstrations.load,
+    ):
         assert not any("action" in name for name in inspect.signature(call).parameters)
     for name in ("action", "actions", "state", "reward"):
         with pytest.raises(AttributeError):
@@ -266,6 +271,45 @@ def test_parts_that_do_not_fit_are_refused(change, message):
 def test_other_arrays_than_frames_are_refused(frames, message):
     with pytest.raises(UserError, match=message):
         Demonstrations.from_arrays(frames, ["go up"] * len(frames))
+
+
+GOOD = np.zeros((3, 3, 16, 24), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("frames", "sentence", "said"),
+    [
+        (GOOD[:1], "go", " has 1 frame: a demonstration shows at least one step"),
+        (GOOD[:0], "go", "at least one frame"),
+        (GOOD, " ", r"has no instruction \(found ' '\)"),
+        (GOOD, None, r"has no instruction \(found None\)"),
+        (GOOD, "jump", "unknown word 'jump'"),
+        (GOOD[..., :8], "go", r"\[3, 16, 8\], the others have \[3, 16, 24\] \(such as episode 'a'"),
+        (GOOD.transpose(0, 2, 3, 1), "go", "with the colours last"),
+        (GOOD[:, 0], "go", "C is 1 for grey"),
+        (np.zeros((3, 4, 16, 24), np.uint8), "go", r"an alpha channel: .* frames\[:, :3\]"),
+        (GOOD / np.float32(1), "go", r"float32 .* of 0 to 0: .*np.round\(255 \* frames\)"),
+        (GOOD + 200.0, "go", r"float64 .* of 200 to 200: .*np.round\(frames\)"),
+        (GOOD.astype(np.int64), "go", "is torch.int64"),
+        ([GOOD[0], GOOD[0, :, :8]], "go", "not arrays of one size"),
+    ],
+)
+def test_what_is_wrong_with_an_episode_is_said_with_its_name(frames, sentence, said):
+    given = [("a", GOOD, "go"), ("b", frames, sentence)]
+    with pytest.raises(UserError, match=f"^episode 'b'.*{said}"):
+        Demonstrations.from_episodes(given, vocabulary=Vocabulary(["go"]))
+
+
+def test_arrays_may_be_views():
+    drawn = np.random.default_rng(0).integers(256, size=(3, 16, 24, 3), dtype=np.uint8)
+    rgb = drawn[..., ::-1].transpose(0, 3, 1, 2)  # as OpenCV's pictures are turned into RGB
+    demos = Demonstrations.from_episodes([("a", rgb, "go")], close=False)
+    assert np.array_equal(demos[0]["pixels"].numpy(), rgb)
+
+
+def test_no_episode_at_all_is_refused():
+    with pytest.raises(UserError, match="there is no episode"):
+        Demonstrations.from_episodes([])
 
 
 def test_sampling_from_nothing_is_refused(demos):

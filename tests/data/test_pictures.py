@@ -1,5 +1,6 @@
 import json
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -36,6 +37,65 @@ def test_animations_hold_every_frame(tmp_path):
     large = all_frames(demos).repeat_interleave(2, -1).repeat_interleave(2, -2)
     assert torch.equal(all_frames(back), large)
     assert back.sentences() == demos.sentences()
+
+
+def test_videos_show_every_frame_at_twice_the_size(demos, tmp_path):
+    save_pictures(demos, tmp_path / "shown", kind="mp4", scale=2)
+    assert {path.suffix for path in (tmp_path / "shown").iterdir()} == {".mp4", ".jsonl"}
+    back = load_pictures(tmp_path / "shown", close=False)
+    assert back.sentences() == demos.sentences()
+    assert torch.equal(back.lengths, demos.lengths)
+    assert back.image_shape == (3, 96, 96)
+    large = all_frames(demos).repeat_interleave(2, -1).repeat_interleave(2, -2)
+    assert (all_frames(back).float() - large.float()).abs().mean() < 8
+
+
+def test_grey_frames_become_pictures(tmp_path):
+    frames = torch.randint(256, (4, 1, 16, 24), dtype=torch.uint8)
+    demos = Demonstrations.from_arrays([frames], ["go on"])
+    save_pictures(demos, tmp_path / "shown")
+    assert torch.equal(
+        all_frames(load_pictures(tmp_path / "shown"))[:4], frames.expand(4, 3, 16, 24)
+    )
+
+
+@pytest.mark.parametrize("kind", ["png", "gif", "mp4"])
+def test_frames_that_are_no_pictures_are_refused(kind, tmp_path):
+    frames = torch.zeros(4, 2, 16, 24, dtype=torch.uint8)
+    with pytest.raises(UserError, match="1 or 3 colours, these frames have 2"):
+        save_pictures(Demonstrations.from_arrays([frames], ["go"]), tmp_path / "shown", kind=kind)
+    assert not list(tmp_path.iterdir())
+
+
+def test_videos_with_odd_sides_are_refused(tmp_path):
+    demos = Demonstrations.from_arrays([torch.zeros(4, 3, 15, 24, dtype=torch.uint8)], ["go"])
+    with pytest.raises(UserError, match="even numbers of pixels, these images have 24x15: give sc"):
+        save_pictures(demos, tmp_path / "shown", kind="mp4")
+    assert not list(tmp_path.iterdir())
+    save_pictures(demos, tmp_path / "shown", kind="mp4", scale=2)
+    assert load_pictures(tmp_path / "shown").image_shape == (3, 30, 48)
+
+
+def test_videos_that_are_cut_short_are_refused(demos, tmp_path):
+    save_pictures(demos[:1], tmp_path / "shown", kind="mp4")
+    path = tmp_path / "shown" / "0.mp4"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match=r"^episode '0': .*0\.mp4 cannot be read"):
+        load_pictures(tmp_path / "shown")
+    with av.open(path, "w", options={"movflags": "faststart"}) as video:
+        stream = video.add_stream("mjpeg", rate=4, options={"qscale": "1"})
+        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuvj420p"
+        for _ in range(9):
+            noise = np.random.default_rng(0).integers(256, size=(64, 64, 3), dtype=np.uint8)
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(noise)))
+        video.mux(stream.encode())
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 2 // 3])
+    with pytest.raises(
+        UserError, match=r"^episode '0': .* is cut short: it has . frames and says 9"
+    ):
+        load_pictures(tmp_path / "shown")
 
 
 def test_episodes_that_do_not_show_their_stop_are_closed(tmp_path):
@@ -78,6 +138,22 @@ def small(folder):
     picture(folder / "b" / "1.png", 3, size=(8, 8))
 
 
+def all_small(folder):
+    for step in range(2):
+        picture(folder / "b" / f"{step}.png", 3, size=(8, 8))
+
+
+def cut(folder):
+    path = folder / "b" / "1.png"
+    noise = np.random.default_rng(0).integers(256, size=(16, 24, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(path)
+    path.write_bytes(path.read_bytes()[:700])
+
+
+def deep(folder):
+    Image.fromarray(np.full((16, 24), 1000, np.uint16)).save(folder / "b" / "1.png")
+
+
 @pytest.mark.parametrize(
     ("how", "said"),
     [
@@ -93,7 +169,13 @@ def small(folder):
         (lambda f: write(f, [("a", "go", [0, 1]), ("c", "go", [])]), "episode 'c' has no frames"),
         (lambda f: [p.unlink() for p in (f / "b").iterdir()], "episode 'b' has no frames"),
         (lambda f: (f / "b" / "1.png").unlink(), "episode 'b' has 1 frame"),
-        (small, "episode 'b': 1.png has 8x8 pixels, those of episode 'a' have 24x16"),
+        (small, "episode 'b': 1.png has 8x8 pixels, the first frame has 24x16"),
+        (
+            all_small,
+            r"episode 'b' has images \[3, 8, 8\], the others have \[3, 16, 24\] .*'a'",
+        ),
+        (cut, r"episode 'b': 1\.png cannot be read \(image file is truncated"),
+        (deep, "episode 'b': 1.png has numbers of mode 'I;16': save it with 8 bits"),
         (
             lambda f: (f / "b" / "1.png").write_bytes(b"no picture"),
             "episode 'b': .* cannot be read",

@@ -5,12 +5,14 @@ from ifo_grounding.data.buffers import first_frame_buffer, goal_buffer
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.huggingface import from_huggingface, to_huggingface
 from ifo_grounding.data.labelling import (
     Labelled,
     LabelReport,
     label_demonstrations,
     labelled_buffer,
 )
+from ifo_grounding.data.minari import from_minari, to_minari
 from ifo_grounding.data.pictures import load_pictures, save_pictures
 from ifo_grounding.data.recording import record_demonstrations
 from ifo_grounding.data.transitions import (
@@ -36,6 +38,8 @@ __all__ = [
     "bot_outcomes",
     "collect_transitions",
     "first_frame_buffer",
+    "from_huggingface",
+    "from_minari",
     "goal_buffer",
     "label_demonstrations",
     "labelled_buffer",
@@ -43,4 +47,6 @@ __all__ = [
     "record_babyai",
     "record_demonstrations",
     "save_pictures",
+    "to_huggingface",
+    "to_minari",
 ]

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.errors import UserError
-
-PIECE_FRAMES = 512
-LEAST_SIDE = 8
-"""Arrays whose last axis alone is shorter than this are taken for images with colours last."""
 
 
 def check_parts(
@@ -63,32 +57,3 @@ def distinct_rows(tokens: Tensor) -> Tensor:
     rows = np.ascontiguousarray(tokens.numpy().astype(">i4"))
     as_bytes = rows.view([("", f"V{rows.shape[1] * 4}")]).reshape(-1)
     return torch.from_numpy(rows[np.unique(as_bytes, return_index=True)[1]].astype(np.int64))
-
-
-def pieces(episodes: Iterable[Tensor | np.ndarray], lengths: list[int]) -> Iterator[Tensor]:
-    """Yield frames of several episodes together, and note the length of each episode."""
-    waiting: list[Tensor] = []
-    for episode in episodes:
-        frames = torch.as_tensor(episode)
-        if frames.ndim != 4 or not len(frames) or frames.dtype != torch.uint8:
-            raise UserError(
-                f"episode {len(lengths)} is {frames.dtype} {list(frames.shape)}: give uint8 "
-                "[T + 1, C, H, W] with at least one frame"
-            )
-        if frames.shape[-1] in (3, 4) and min(frames.shape[1:3]) >= LEAST_SIDE:
-            raise UserError(
-                f"episode {len(lengths)} has images {list(frames.shape[1:])}, with the colours "
-                "last: give [T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"
-            )
-        if waiting and frames.shape[1:] != waiting[0].shape[1:]:
-            raise UserError(
-                f"episode {len(lengths)} has images {list(frames.shape[1:])}, the others have "
-                f"{list(waiting[0].shape[1:])}"
-            )
-        lengths.append(len(frames))
-        waiting.append(frames)
-        if sum(map(len, waiting)) >= PIECE_FRAMES:
-            yield torch.cat(waiting)
-            waiting = []
-    if waiting:
-        yield torch.cat(waiting)

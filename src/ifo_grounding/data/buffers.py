@@ -11,6 +11,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose
 
 from ifo_grounding import keys
+from ifo_grounding.data._spool import same_rows
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
 
@@ -56,7 +57,7 @@ def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer
     step = torch.arange(len(episode)) - (lengths.cumsum(0) - lengths)[episode]
     frame = demos.starts[episode] + step
     last = demos.starts + lengths - 1
-    earlier = (demos.codes[frame] != demos.codes[last[episode]]).flatten(1).any(1)
+    earlier = ~same_rows(demos.codes, frame, last[episode])
     balance = torch.zeros(len(demos), dtype=torch.int64).scatter_add_(0, episode, earlier.long())
     finished = torch.arange(len(demos)).repeat_interleave(balance.clamp(min=1))
     episodes = torch.cat([episode[earlier], finished])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 
 from ifo_grounding import mosaic
+from ifo_grounding.data import _spool
+from ifo_grounding.data._spool import Spool, join
 from ifo_grounding.data._tile_index import TileIndex
 from ifo_grounding.errors import UserError
 
@@ -17,6 +20,9 @@ CODE_DTYPES = (torch.uint8, torch.int16, torch.int32)
 CHUNK_BYTES = 4 << 20
 SAMPLE_FRAMES = 256
 PATIENCE_FRAMES = 4096
+PATIENCE_BYTES = 64 << 20
+WORTH = 0.5
+"""Share of the pixels that a dictionary and codes may take once patience is at its end."""
 PIECE_FRAMES = 2048
 
 
@@ -104,7 +110,8 @@ class FrameCodec:
 
         Args:
             frames: images, uint8 [F, C, H, W], or an iterable of such pieces, which may come from
-                disk: pixels of one piece are in memory at a time.
+                disk: pixels of one piece are in memory at a time. Codes of more than 128 MiB, such
+                as raw pixels, are kept in a scratch file that is mapped into memory.
             tile_size: 8, 16, 32 or 64; the cheapest one by default.
 
         Returns:
@@ -120,16 +127,17 @@ class FrameCodec:
             raise UserError("no frames: give at least one piece, uint8 [F, C, H, W]")
         image_shape = _checked(first).shape[1:]
         codec = cls._empty(image_shape, _tile_size(first, total or len(first), tile_size))
-        parts: list[Tensor] = []
+        patience = min(PATIENCE_FRAMES, PATIENCE_BYTES // max(image_shape.numel(), 1))
+        codes = Spool()
         seen = 0
-        for piece in _chain(first, pieces):
-            parts.append(codec.update(piece))
+        for piece in itertools.chain([first], pieces):
+            codes.append(codec.update(piece))
             seen += len(piece)
-            if seen >= PATIENCE_FRAMES and not codec._saves(seen):
-                codec = codec._give_up(parts)
-        if not codec._saves(seen):
-            codec = codec._give_up(parts)
-        return codec, join(parts, codec.code_dtype)
+            if seen >= patience and codec._share(seen) > WORTH:
+                codec, codes = codec._give_up(codes)
+        if codec._share(seen) > 1:
+            codec, codes = codec._give_up(codes)
+        return codec, codes.tensor(codec.code_dtype)
 
     @classmethod
     def from_tiles(
@@ -225,19 +233,21 @@ class FrameCodec:
         shape = (0, image_shape[0], tile_size, tile_size)
         return cls(image_shape, torch.empty(shape, dtype=torch.uint8))
 
-    def _saves(self, frames: int) -> bool:
-        """Tell whether the dictionary and the codes of so many frames are smaller than pixels."""
-        if self._index is None:
-            return True
-        code = math.prod(self.code_shape) * self.code_dtype.itemsize
-        tile = math.prod(self.image_shape) // math.prod(self.code_shape)
-        return len(self._index) * tile + frames * code <= frames * math.prod(self.image_shape)
+    def _share(self, frames: int) -> float:
+        """Return the bytes of dictionary and codes of so many frames as a share of their pixels.
 
-    def _give_up(self, parts: list[Tensor]) -> FrameCodec:
-        """Turn codes back into pixels, in place, and return a raw codec."""
-        for number, part in enumerate(parts):
-            parts[number] = self.decode(part.view(-1, *self.code_shape))
-        return FrameCodec(self.image_shape)
+        The dictionary is always in memory: one beyond the bound counts as endless.
+        """
+        if self._index is None or not frames:
+            return 0.0
+        pixels = math.prod(self.image_shape)
+        tiles = len(self._index) * pixels // math.prod(self.code_shape)
+        codes = frames * math.prod(self.code_shape) * self.code_dtype.itemsize
+        return math.inf if tiles > _spool.MEMORY_BYTES else (tiles + codes) / (frames * pixels)
+
+    def _give_up(self, codes: Spool) -> tuple[FrameCodec, Spool]:
+        """Turn codes back into pixels and return them with a raw codec."""
+        return FrameCodec(self.image_shape), codes.map(self.decode)
 
 
 def decode(words: Tensor, codes: Tensor) -> Tensor:
@@ -270,24 +280,6 @@ def cut(frames: Tensor, tile_size: int) -> Tensor:
 def smallest_dtype(count: int) -> torch.dtype:
     """Return the smallest of uint8, int16 and int32 that holds ``0 .. count - 1``."""
     return next(dtype for dtype in CODE_DTYPES if count - 1 <= torch.iinfo(dtype).max)
-
-
-def join(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
-    """Concatenate codes as ``dtype``; the list is emptied, so that not both are in memory."""
-    if len(parts) == 1:
-        return parts.pop().to(dtype)
-    joined = torch.empty(sum(map(len, parts)), *parts[0].shape[1:], dtype=dtype)
-    end = len(joined)
-    while parts:
-        part = parts.pop()
-        joined[end - len(part) : end] = part
-        end -= len(part)
-    return joined
-
-
-def _chain(first: Tensor, rest: Iterator[Tensor]) -> Iterator[Tensor]:
-    yield first
-    yield from rest
 
 
 def _checked(frames: Tensor, ndim: int = 4) -> Tensor:

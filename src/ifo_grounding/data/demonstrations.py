@@ -13,7 +13,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from ifo_grounding import keys
-from ifo_grounding.data._episodes import check_parts, distinct_rows, pieces, row_numbers
+from ifo_grounding.data._episodes import check_parts, distinct_rows, row_numbers
+from ifo_grounding.data._reading import Episode, Reader
+from ifo_grounding.data._spool import same_rows, take
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.folder import fact, load_folder, save_folder
 from ifo_grounding.errors import UserError
@@ -108,9 +110,44 @@ class Demonstrations:
             sentences = list(instructions)
             vocabulary = vocabulary or Vocabulary.from_sentences(sentences)
             instructions = vocabulary.encode(sentences)
-        lengths: list[int] = []
-        codec, codes = FrameCodec.compress(pieces(frames, lengths), tile_size)
-        return cls(codec, codes, torch.tensor(lengths), instructions, vocabulary=vocabulary)
+        reader = Reader()
+        episodes = ((number, shown, "as said") for number, shown in enumerate(frames))
+        codec, codes = FrameCodec.compress(reader.pieces(episodes), tile_size)
+        return cls(codec, codes, torch.tensor(reader.lengths), instructions, vocabulary=vocabulary)
+
+    @classmethod
+    def from_episodes(
+        cls,
+        episodes: Iterable[Episode],
+        *,
+        vocabulary: Vocabulary | None = None,
+        tile_size: int | None = None,
+        close: bool = True,
+    ) -> Demonstrations:
+        """Take episodes one after the other: pixels of a few are in memory at a time.
+
+        Args:
+            episodes: name, frames and instruction of each; frames are uint8 [T + 1, C, H, W], at
+                least two. A generator is read once.
+            vocabulary: the words of the instructions; by default those that occur.
+            tile_size: of the codec; the cheapest one by default.
+            close: whether to repeat the last frame of episodes that do not show their stop.
+
+        Raises:
+            UserError: naming the episode that is not as it has to be.
+
+        >>> shown = torch.arange(2, dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 48, 48)
+        >>> Demonstrations.from_episodes(("a", shown, "go on") for _ in range(2)).lengths
+        tensor([3, 3])
+        """
+        reader = Reader(least=2, close=close, vocabulary=vocabulary)
+        codec, codes = FrameCodec.compress(reader.pieces(episodes), tile_size)
+        sentences = reader.sentences
+        words = vocabulary or Vocabulary.from_sentences(
+            sentences, max(len(sentence.split()) for sentence in sentences)
+        )
+        tokens = words.encode(sentences)
+        return cls(codec, codes, torch.tensor(reader.lengths), tokens, vocabulary=words)
 
     # ---- What there is ----------------------------------------------------------------------
 
@@ -221,10 +258,9 @@ class Demonstrations:
         """
         last = self._starts + self._lengths - 1
         before = (last - 1).maximum(self._starts)
-        same = (self.codes[last] == self.codes[before]).flatten(1).all(1)
-        open_ended = ~same | (self._lengths == 1)
+        open_ended = ~same_rows(self.codes, last, before) | (self._lengths == 1)
         lengths = self._lengths + open_ended
-        codes = self.codes[row_numbers(self._starts, self._lengths, lengths)]
+        codes = take(self.codes, row_numbers(self._starts, self._lengths, lengths))
         return Demonstrations(
             self.codec,
             codes,
@@ -309,7 +345,8 @@ class Demonstrations:
         """Write a folder of ``.npy`` files and ``meta.json``; of a selection, its frames alone."""
         in_a_row = torch.equal(self._starts, self._lengths.cumsum(0) - self._lengths)
         whole = in_a_row and self.n_frames == len(self.codes)
-        codes = self.codes if whole else self.codes[row_numbers(self._starts, self._lengths)]
+        rows = row_numbers(self._starts, self._lengths)
+        codes = self.codes if whole else take(self.codes, rows)
         arrays = {"codes": codes, "lengths": self._lengths, "instructions": self.tokens}
         if self.codec.tiles is not None:
             arrays["tiles"] = self.codec.tiles

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from tensordict import MemoryMappedTensor
 from torch import Tensor
 
 from ifo_grounding.errors import UserError
@@ -39,7 +41,7 @@ def save_folder(
         listed = {}
         for name, tensor in arrays.items():
             path = temporary / f"{name}.npy"
-            np.save(path, tensor.detach().cpu().numpy(), allow_pickle=False)
+            _save_array(path, tensor)
             listed[name] = {
                 "dtype": str(tensor.dtype).removeprefix("torch."),
                 "shape": list(tensor.shape),
@@ -93,6 +95,27 @@ def load_folder(
     if foreign := sorted(set(listed) - set(names) - set(optional)):
         raise UserError(f"{folder} holds {', '.join(foreign)}, which {kind} have no place for")
     return {name: _load_array(folder / f"{name}.npy", listed[name]) for name in listed}, facts
+
+
+def _save_array(path: Path, tensor: Tensor) -> None:
+    array = tensor.detach().cpu().numpy()
+    source = _file_of(tensor)
+    if source is None:
+        np.save(path, array, allow_pickle=False)
+        return
+    # From file to file: pages of a mapping that are read count as memory of this process.
+    with path.open("wb") as target, source.open("rb") as opened:
+        header = np.lib.format.header_data_from_array_1_0(array)
+        np.lib.format.write_array_header_1_0(target, header)
+        shutil.copyfileobj(opened, target, BLOCK_BYTES)
+
+
+def _file_of(tensor: Tensor) -> Path | None:
+    """Return the file that holds a tensor and nothing else, None where there is none."""
+    if not isinstance(tensor, MemoryMappedTensor):
+        return None
+    path = Path(tensor.filename)
+    return path if path.stat().st_size == tensor.nbytes else None
 
 
 def fact(facts: Mapping[str, Any], name: str, kinds: type | tuple[type, ...]) -> Any:

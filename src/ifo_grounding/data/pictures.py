@@ -1,4 +1,4 @@
-"""Demonstrations from and to pictures: a list of instructions, and frames of each episode."""
+"""Demonstrations from and to pictures and videos: a list of instructions, and frames of each."""
 
 from __future__ import annotations
 
@@ -10,27 +10,31 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageSequence, UnidentifiedImageError
+from torch import Tensor
 from tqdm import tqdm
 
+from ifo_grounding.data._reading import COLOURS, naming, stack_pictures
+from ifo_grounding.data._video import read_video, write_video
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import atomic_write
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 LIST = "episodes.jsonl"
-FORMATS = ("png", "gif")
+FORMATS = ("png", "gif", "mp4")
+VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm"}
 FILES = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
 MILLISECONDS = 250
 
 
 @dataclass(frozen=True)
-class Episode:
+class Listed:
     """A line of the list."""
 
     name: str
     instruction: str
     path: Path
-    """Folder of pictures, in the order of their names, or one animated picture."""
+    """Folder of pictures, in the order of their names, one animated picture, or a video."""
 
 
 def load_pictures(
@@ -45,11 +49,13 @@ def load_pictures(
 
     The folder holds ``episodes.jsonl`` with one line per episode, such as
     ``{"episode": "0001", "instruction": "go to the red ball"}``, and for each of them a folder of
-    that name with its frames, in the order of their names, or an animated picture of that name
-    (``0001.gif``). A line may name another path as ``"frames"``.
+    that name with its frames, in the order of their names, an animated picture of that name
+    (``0001.gif``) or a video (``0001.mp4``, with the extra ``video``). A line may name another path
+    as ``"frames"``.
 
-    Frames are read one episode after the other and stored compactly: the pixels of all episodes
-    are never in memory together, unless no tile repeats.
+    Frames are read one episode after the other: the pixels of all episodes are never in memory
+    together. A video is lossy: its frames are those that a player shows, not those that were
+    recorded, and a repeated last frame may come back a little different.
 
     Args:
         folder: where from.
@@ -62,24 +68,16 @@ def load_pictures(
         UserError: naming the episode, where a line, a frame or an instruction is not as it has to
             be.
     """
-    folder = Path(folder)
-    episodes = read_list(folder)
-    sentences = [episode.instruction for episode in episodes]
-    words = vocabulary or Vocabulary.from_sentences(
-        sentences, max(len(s.split()) for s in sentences)
+    shown = (
+        (one.name, stack_pictures(one.name, _pictures(one)), one.instruction)
+        for one in tqdm(read_list(Path(folder)), desc="read", disable=not progress)
     )
-    for episode in episodes:
-        try:
-            words.encode(episode.instruction)
-        except UserError as error:
-            raise UserError(f"episode {episode.name!r}: {error}") from None
-    demos = Demonstrations.from_arrays(
-        _frames(episodes, progress), sentences, vocabulary=words, tile_size=tile_size
+    return Demonstrations.from_episodes(
+        shown, vocabulary=vocabulary, tile_size=tile_size, close=close
     )
-    return demos.close_episodes() if close else demos
 
 
-def read_list(folder: Path) -> list[Episode]:
+def read_list(folder: Path) -> list[Listed]:
     """Read the list of a folder's episodes.
 
     Raises:
@@ -91,7 +89,7 @@ def read_list(folder: Path) -> list[Episode]:
             f"{path} does not exist: write one line per episode, such as "
             '{"episode": "0001", "instruction": "go to the red ball"}'
         )
-    episodes: list[Episode] = []
+    episodes: list[Listed] = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         if not line.strip():
             continue
@@ -104,7 +102,7 @@ def read_list(folder: Path) -> list[Episode]:
             ) from None
         if not instruction:
             raise UserError(f"episode {name!r} has no instruction ({path}, line {number})")
-        episodes.append(Episode(name, instruction, _where(folder, name, entry.get("frames"))))
+        episodes.append(Listed(name, instruction, _where(folder, name, entry.get("frames"))))
     if not episodes:
         raise UserError(f"{path} lists no episode")
     name, times = Counter(episode.name for episode in episodes).most_common(1)[0]
@@ -117,37 +115,15 @@ def _where(folder: Path, name: str, given: object) -> Path:
     if given is not None:
         path = folder / str(given)
     else:
-        path = next(
-            (p for p in (folder / name, folder / f"{name}.gif") if p.exists()), folder / name
-        )
+        paths = [folder / f"{name}{suffix}" for suffix in ("", ".gif", *sorted(VIDEOS))]
+        path = next((path for path in paths if path.exists()), paths[0])
     if not path.exists():
         raise UserError(f"episode {name!r} has no frames: {path} does not exist")
     return path
 
 
-def _frames(episodes: list[Episode], progress: bool) -> Iterator[np.ndarray]:
-    """Yield the frames of each episode, uint8 [T + 1, 3, H, W]."""
-    first: tuple[str, tuple[int, int]] | None = None
-    for episode in tqdm(episodes, desc="read", disable=not progress):
-        frames = []
-        for place, picture in _pictures(episode):
-            first = first or (episode.name, picture.size)
-            if picture.size != first[1]:
-                raise UserError(
-                    f"episode {episode.name!r}: {place} has {_size(picture.size)} pixels, those of "
-                    f"episode {first[0]!r} have {_size(first[1])}: scale them to one size"
-                )
-            frames.append(np.asarray(picture))
-        if len(frames) < 2:
-            raise UserError(
-                f"episode {episode.name!r} has {len(frames)} frame: a demonstration shows at least "
-                "one step, which takes two"
-            )
-        yield np.stack(frames).transpose(0, 3, 1, 2)
-
-
-def _pictures(episode: Episode) -> Iterator[tuple[str, Image.Image]]:
-    """Yield name and RGB picture of each frame."""
+def _pictures(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
+    """Yield name and picture of each frame."""
     if episode.path.is_dir():
         paths = sorted(p for p in episode.path.iterdir() if p.suffix.lower() in FILES)
         if not paths:
@@ -155,6 +131,11 @@ def _pictures(episode: Episode) -> Iterator[tuple[str, Image.Image]]:
                 f"episode {episode.name!r} has no frames: {episode.path} holds none of "
                 + ", ".join(sorted(FILES))
             )
+    elif episode.path.suffix.lower() in VIDEOS:
+        with naming(episode.name):
+            for number, frame in enumerate(read_video(episode.path)):
+                yield f"{episode.path.name}, frame {number}", frame
+        return
     else:
         paths = [episode.path]
     for path in paths:
@@ -162,13 +143,9 @@ def _pictures(episode: Episode) -> Iterator[tuple[str, Image.Image]]:
             with Image.open(path) as opened:
                 for number, frame in enumerate(ImageSequence.Iterator(opened)):
                     name = path.name if episode.path.is_dir() else f"{path.name}, frame {number}"
-                    yield name, frame.convert("RGB")
+                    yield name, frame
         except (UnidentifiedImageError, OSError, SyntaxError) as error:
             raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
-
-
-def _size(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
 
 
 def save_pictures(
@@ -179,17 +156,19 @@ def save_pictures(
     Args:
         demos: with a vocabulary.
         folder: where to; it appears when everything is written, and :func:`load_pictures` reads it.
-        kind: ``png``, a folder of frames per episode, or ``gif``, an animation of each. A GIF holds
-            256 colours a frame: pictures with more come back changed.
+        kind: ``png``, a folder of frames per episode; ``gif``, an animation of each; or ``mp4``, a
+            video of each, with the extra ``video``. A GIF holds 256 colours a frame, and a video is
+            lossy: to keep frames as they are, take ``png``.
         scale: by which every pixel is enlarged.
 
     Raises:
-        UserError: where there is no vocabulary, or an unknown kind.
+        UserError: where there is no vocabulary, the kind is unknown, or images do not fit it.
     """
     check_choice("kind", kind, FORMATS)
     if scale < 1:
         raise UserError(f"scale must be at least 1, got {scale}")
     sentences = demos.sentences()
+    check_colours(demos)
     digits = len(str(len(demos) - 1))
     with atomic_write(folder) as temporary:
         temporary.mkdir()
@@ -197,8 +176,11 @@ def save_pictures(
         for number, sentence in enumerate(sentences):
             name = f"{number:0{digits}d}"
             lines.append(json.dumps({"episode": name, "instruction": sentence}))
-            frames = demos[number]["pixels"].permute(0, 2, 3, 1).numpy()
-            pictures = [_enlarged(Image.fromarray(frame), scale) for frame in frames]
+            frames = rgb(demos[number]["pixels"]).repeat(scale, 1).repeat(scale, 2)
+            if kind == "mp4":
+                write_video(temporary / f"{name}.mp4", frames, fps=1000 / MILLISECONDS)
+                continue
+            pictures = [Image.fromarray(frame) for frame in frames]
             if kind == "gif":
                 pictures[0].save(
                     temporary / f"{name}.gif",
@@ -214,6 +196,12 @@ def save_pictures(
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _enlarged(picture: Image.Image, scale: int) -> Image.Image:
-    size = (picture.width * scale, picture.height * scale)
-    return picture if scale == 1 else picture.resize(size, Image.Resampling.NEAREST)
+def check_colours(demos: Demonstrations) -> None:
+    """Refuse frames that are no pictures."""
+    if demos.image_shape[0] not in COLOURS:
+        raise UserError(f"pictures have 1 or 3 colours, these frames have {demos.image_shape[0]}")
+
+
+def rgb(pixels: Tensor) -> np.ndarray:
+    """Return frames [*B, C, H, W] of one or three colours as pictures, uint8 [*B, H, W, 3]."""
+    return pixels.expand(*pixels.shape[:-3], 3, -1, -1).movedim(-3, -1).contiguous().numpy()

@@ -1,0 +1,171 @@
+"""Demonstrations from and to Hugging Face ``datasets``: one row per episode."""
+
+from __future__ import annotations
+
+import itertools
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from ifo_grounding.data._reading import Episode, stack_pictures
+from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.pictures import check_colours, rgb
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks.vocabulary import Vocabulary
+
+if TYPE_CHECKING:
+    import datasets
+
+FRAMES, INSTRUCTION = "frames", "instruction"
+ROWS_IN_MEMORY = 16
+
+
+def from_huggingface(
+    dataset: datasets.Dataset | datasets.IterableDataset | Iterable[Mapping[str, Any]],
+    *,
+    frames: str = FRAMES,
+    instruction: str = INSTRUCTION,
+    vocabulary: Vocabulary | None = None,
+    tile_size: int | None = None,
+    close: bool = True,
+    progress: bool = False,
+) -> Demonstrations:
+    """Read a dataset with one row per episode, row by row.
+
+    Only the two columns that are named are read, whatever else there is.
+
+    Args:
+        dataset: one split as a ``Dataset`` or ``IterableDataset``, or rows from anywhere. An
+            episode's frames are pictures (of Pillow, or PNG or JPEG as ``{"bytes": ...}``), or
+            one array, uint8 [T + 1, C, H, W].
+        frames: name of the column of frames.
+        instruction: name of the column of instructions.
+        vocabulary: the words of the instructions; by default those that occur.
+        tile_size: of the codec; the cheapest one by default.
+        close: whether to repeat the last frame of episodes that do not show their stop.
+        progress: whether to show a bar.
+
+    Raises:
+        UserError: where a column is missing, or an episode is not as it has to be, with the number
+            of its row.
+
+    >>> shown = [Image.new("RGB", (48, 48), colour) for colour in ("red", "blue")]
+    >>> from_huggingface([{"frames": shown, "instruction": "go on"}]).lengths
+    tensor([3])
+    """
+    rows = tqdm(_selected(dataset, frames, instruction), desc="read", disable=not progress)
+    return Demonstrations.from_episodes(
+        _episodes(rows, frames, instruction),
+        vocabulary=vocabulary,
+        tile_size=tile_size,
+        close=close,
+    )
+
+
+def _selected(dataset: Any, frames: str, instruction: str) -> Iterable[Mapping[str, Any]]:
+    """Leave two columns of a dataset; other iterables stay as they are."""
+    if isinstance(dataset, Mapping):
+        splits = ", ".join(map(repr, dataset))
+        raise UserError(f"choose one of the splits: dataset[...] with {splits}")
+    if not hasattr(dataset, "select_columns"):
+        return dataset
+    columns = dataset.column_names  # None where a stream does not know them yet
+    for name, option in ((frames, "frames"), (instruction, "instruction")):
+        if columns is not None and name not in columns:
+            raise UserError(
+                f"the dataset has no column {name!r}, but {', '.join(columns)}: name it with "
+                f"{option}=..."
+            )
+    return dataset.with_format(None).select_columns([frames, instruction])
+
+
+def _episodes(
+    rows: Iterable[Mapping[str, Any]], frames: str, instruction: str
+) -> Iterator[Episode]:
+    for number, row in _numbered(rows):
+        if missing := {frames, instruction} - set(row):
+            raise UserError(f"episode {number} has no {' and no '.join(sorted(missing))}")
+        shown = row[frames]
+        if len(shown) and isinstance(shown[0], Image.Image | Mapping):
+            shown = stack_pictures(number, _pictures(number, shown))
+        yield number, shown, row[instruction]
+
+
+def _numbered(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """Number rows, and name one whose pictures ``datasets`` cannot decode."""
+    rest = iter(rows)
+    for number in itertools.count():
+        try:
+            row = next(rest)
+        except StopIteration:
+            return
+        except (OSError, SyntaxError) as error:
+            raise UserError(f"episode {number} cannot be read ({error})") from None
+        yield number, row
+
+
+def _pictures(number: int, shown: Iterable[Any]) -> Iterator[tuple[str, Image.Image]]:
+    for step, picture in enumerate(shown):
+        if isinstance(picture, Mapping):
+            content = picture.get("bytes")
+            try:
+                picture = Image.open(picture["path"] if content is None else BytesIO(content))
+            except (OSError, SyntaxError) as error:
+                raise UserError(
+                    f"episode {number}: frame {step} cannot be read ({error})"
+                ) from None
+        yield f"frame {step}", picture
+
+
+def to_huggingface(
+    demos: Demonstrations, *, cache_dir: str | Path | None = None
+) -> datasets.Dataset:
+    """Turn demonstrations into a dataset with the columns ``frames`` and ``instruction``.
+
+    Frames are PNG files, without loss; grey ones become RGB. The rows are written to the cache of
+    ``datasets`` a few at a time: ``save_to_disk``, ``to_parquet`` or ``push_to_hub`` carry them on.
+
+    Args:
+        demos: with a vocabulary.
+        cache_dir: where rows are written; by default the cache of ``datasets``.
+
+    Raises:
+        UserError: where ``datasets`` is missing, there is no vocabulary, or frames are no pictures.
+    """
+    try:
+        import datasets
+    except ImportError:
+        raise UserError("this needs datasets: pip install 'ifo-grounding[datasets]'") from None
+    sentences = demos.sentences()
+    check_colours(demos)
+
+    def rows() -> Iterator[dict[str, Any]]:
+        for number, sentence in enumerate(sentences):
+            shown = [{"bytes": _png(one), "path": None} for one in rgb(demos[number]["pixels"])]
+            yield {FRAMES: shown, INSTRUCTION: sentence}
+
+    return datasets.Dataset.from_generator(
+        rows,
+        features=datasets.Features(
+            {
+                FRAMES: datasets.Sequence(datasets.Image()),
+                INSTRUCTION: datasets.Value("string"),
+            }
+        ),
+        cache_dir=None if cache_dir is None else str(cache_dir),
+        # Without a name of its own, the dataset would be named by a hash of the pickled pixels.
+        fingerprint=uuid.uuid4().hex,
+        writer_batch_size=ROWS_IN_MEMORY,
+    )
+
+
+def _png(frame: np.ndarray) -> bytes:
+    buffer = BytesIO()
+    Image.fromarray(frame).save(buffer, "PNG")
+    return buffer.getvalue()

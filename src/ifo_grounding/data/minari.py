@@ -1,0 +1,243 @@
+"""Demonstrations from and to Minari datasets, whose actions are never read."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+from PIL import Image
+from tqdm import tqdm
+
+from ifo_grounding.data._reading import LAST, Episode
+from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.pictures import check_colours, rgb
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks.vocabulary import Vocabulary
+
+if TYPE_CHECKING:
+    from minari import MinariDataset
+    from minari.data_collector import EpisodeBuffer
+
+IMAGE, INSTRUCTION = "image", "mission"
+ABSENT = "actions_absent"
+DESCRIPTION = (
+    "Observation-only demonstrations: actions and rewards are absent. The format demands them, so "
+    "both are 0 throughout and mean nothing."
+)
+
+Read = Callable[[int, str | None], Any]
+"""Returns one observation of an episode, by its name, as it is stored: [T + 1, ...]."""
+
+
+def from_minari(
+    dataset: MinariDataset | str,
+    *,
+    image: str | None = IMAGE,
+    instruction: str = INSTRUCTION,
+    vocabulary: Vocabulary | None = None,
+    tile_size: int | None = None,
+    close: bool = True,
+    progress: bool = False,
+) -> Demonstrations:
+    """Read the images and instructions of a Minari dataset, episode by episode.
+
+    Its actions and rewards are never read, not even from disk: a dataset that has them gives the
+    same demonstrations as one that has none.
+
+    Args:
+        dataset: a dataset or a part of one, or the id of one on this machine.
+        image: name of the image in the observation; None where the observation is the image.
+        instruction: name of the sentence in the observation, where it is the same throughout an
+            episode, or else in the metadata of the episode or of the dataset.
+        vocabulary: the words of the instructions; by default those that occur.
+        tile_size: of the codec; the cheapest one by default.
+        close: whether to repeat the last frame of episodes that do not show their stop.
+        progress: whether to show a bar.
+
+    Raises:
+        UserError: where Minari or the dataset is missing, the names are not those of the dataset,
+            or an episode is not as it has to be, with its number.
+    """
+    minari = _minari()
+    if isinstance(dataset, str):
+        try:
+            dataset = minari.load_dataset(dataset)
+        except FileNotFoundError as error:
+            raise UserError(str(error)) from None
+    with _opened(dataset) as read:
+        return Demonstrations.from_episodes(
+            _episodes(dataset, read, image, instruction, progress),
+            vocabulary=vocabulary,
+            tile_size=tile_size,
+            close=close,
+        )
+
+
+def _episodes(
+    dataset: MinariDataset, read: Read, image: str | None, instruction: str, progress: bool
+) -> Iterator[Episode]:
+    space, storage = dataset.observation_space, dataset.storage
+    common = storage.metadata
+    known = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
+    shown = space if image is None else known.get(image)
+    if not isinstance(shown, spaces.Box):
+        raise UserError(
+            f"there is no image {image!r} in the observation ({sorted(known) or 'one array'}): "
+            "name it with image=..., or image=None where the observation is the image"
+        )
+    for number in tqdm(dataset.episode_indices.tolist(), desc="read", disable=not progress):
+        try:
+            frames = _decoded(read(number, image), shown, storage.jpeg_encoding)
+            if instruction in known:
+                said = {_text(text) for text in read(number, instruction)}
+            else:
+                facts = common | next(iter(storage.get_episode_metadata([number])))
+                said = {_text(facts[instruction])} if instruction in facts else set()
+        except (OSError, KeyError, ValueError) as error:
+            raise UserError(f"episode {number} cannot be read ({error})") from None
+        if not said:
+            raise UserError(
+                f"there is no instruction {instruction!r} in the observation ({sorted(known)}) or "
+                f"the metadata of episode {number}: name it with instruction=..."
+            )
+        if len(said) > 1:
+            raise UserError(
+                f"episode {number} has {len(said)} instructions: a demonstration follows one"
+            )
+        yield number, frames, said.pop()
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
+    """Return images as they were before they were stored, in the order [T + 1, C, H, W].
+
+    Orders are told apart as ``from_gymnasium`` does; what is neither stays as it is.
+    """
+    from minari.dataset.minari_storage import is_image_space
+
+    if jpeg and is_image_space(space):
+        frames = np.stack([np.asarray(Image.open(BytesIO(bytes(row)))) for row in rows])
+    else:
+        frames = np.stack(rows).reshape(-1, *space.shape)
+    if frames.ndim == 3:
+        return frames[:, None]
+    if frames.ndim == 4 and frames.shape[-1] in LAST and frames.shape[1] not in LAST:
+        return frames.transpose(0, 3, 1, 2)
+    return frames
+
+
+@contextlib.contextmanager
+def _opened(dataset: MinariDataset) -> Iterator[Read]:
+    """Open the observations of a dataset and nothing else: Minari itself reads actions along."""
+    folder, kind = Path(dataset.storage.data_path), dataset.storage.FORMAT
+    if kind != "hdf5":
+        yield functools.partial(_read_table, folder, kind)
+        return
+    import h5py
+
+    try:
+        file = h5py.File(folder / "main_data.hdf5", "r")
+    except OSError as error:
+        raise UserError(f"{folder} cannot be read ({error})") from None
+    with file:
+        yield functools.partial(_read_group, file)
+
+
+def _read_group(file: Any, number: int, name: str | None) -> Any:
+    observations = file[f"episode_{number}/observations"]
+    return (observations if name is None else observations[name])[()]
+
+
+def _read_table(folder: Path, kind: str, number: int, name: str | None) -> Any:
+    from pyarrow import dataset
+
+    column = dataset.field("observations", *([] if name is None else [name]))
+    table = dataset.dataset(
+        folder / str(number), format=kind, ignore_prefixes=["_", ".", "metadata.json"]
+    )
+    return table.to_table(columns={"rows": column})["rows"].to_numpy()
+
+
+def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariDataset:
+    """Write demonstrations as a Minari dataset, with a placeholder instead of actions.
+
+    An observation holds ``image``, uint8 [H, W, 3] without loss, and ``mission``, the instruction.
+    The format demands actions and rewards. Their place is taken by zeros: the action space has a
+    single value, and the dataset's metadata says ``actions_absent``.
+
+    Args:
+        demos: with a vocabulary.
+        dataset_id: such as ``"mine/boxes-v0"``, below ``$MINARI_DATASETS_PATH``.
+        details: for ``minari.create_dataset_from_buffers``, such as ``author``.
+
+    Raises:
+        UserError: where Minari is missing, the dataset exists, there is no vocabulary, or frames
+            are no pictures.
+    """
+    minari = _minari()
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    sentences = demos.sentences()
+    check_colours(demos)
+    folder = get_dataset_path(dataset_id)
+    if folder.exists():
+        raise UserError(f"the dataset {dataset_id!r} exists: choose another name or version")
+    _, height, width = demos.image_shape
+    characters = "".join(sorted(set("".join(sentences))))
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*None", UserWarning)  # of details left out
+            dataset = minari.create_dataset_from_buffers(
+                dataset_id,
+                _buffers(demos, sentences),
+                observation_space=spaces.Dict(
+                    {
+                        IMAGE: spaces.Box(0, 255, (height, width, 3), np.uint8),
+                        INSTRUCTION: spaces.Text(max(map(len, sentences)), charset=characters),
+                    }
+                ),
+                action_space=spaces.Discrete(1),
+                jpeg_encoding=False,
+                **{"description": DESCRIPTION, **details},
+            )
+        dataset.storage.update_metadata({ABSENT: True})
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, ValueError):  # a name that Minari does not take, for one
+            raise UserError(f"{dataset_id!r} cannot be written: {error}") from None
+        raise
+    return dataset
+
+
+def _buffers(demos: Demonstrations, sentences: list[str]) -> Iterator[EpisodeBuffer]:
+    from minari.data_collector import EpisodeBuffer
+
+    for number, sentence in enumerate(sentences):
+        frames = rgb(demos[number]["pixels"])
+        steps = len(frames) - 1
+        yield EpisodeBuffer(
+            observations={IMAGE: frames, INSTRUCTION: [sentence] * len(frames)},
+            actions=np.zeros(steps, np.int64),
+            rewards=np.zeros(steps),
+            terminations=np.arange(steps) == steps - 1,
+            truncations=np.zeros(steps, bool),
+        )
+
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ImportError:
+        raise UserError("this needs Minari: pip install 'ifo-grounding[minari]'") from None
+    return minari

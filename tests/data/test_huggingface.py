@@ -1,0 +1,131 @@
+import datasets
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ifo_grounding.data import (
+    Demonstrations,
+    from_huggingface,
+    record_demonstrations,
+    to_huggingface,
+)
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks import VOCABULARY
+
+datasets.disable_progress_bars()
+
+
+@pytest.fixture
+def demos():
+    return record_demonstrations("move", 12, seed=0)
+
+
+def all_frames(demos):
+    return demos.frames(torch.arange(demos.n_frames))
+
+
+def same(one, other):
+    return (
+        one.sentences() == other.sentences()
+        and torch.equal(one.lengths, other.lengths)
+        and torch.equal(all_frames(one), all_frames(other))
+    )
+
+
+def test_a_dataset_comes_back_as_it_was(demos, tmp_path):
+    dataset = to_huggingface(demos, cache_dir=tmp_path / "cache")
+    assert dataset.num_rows == 12
+    assert dataset.column_names == ["frames", "instruction"]
+    assert dataset[3]["instruction"] == demos.sentences()[3]
+    assert dataset[3]["frames"][0].size == (48, 48)
+    back = from_huggingface(dataset, vocabulary=VOCABULARY)
+    assert same(back, demos)
+    assert torch.equal(back.tokens, demos.tokens)
+    other = record_demonstrations("move", 3, seed=1)
+    assert same(from_huggingface(to_huggingface(other, cache_dir=tmp_path / "cache")), other)
+
+
+def test_files_and_streams_are_read(demos, tmp_path):
+    cache = str(tmp_path / "cache")
+    dataset = to_huggingface(demos, cache_dir=cache)
+    dataset.save_to_disk(tmp_path / "disk")
+    dataset.to_parquet(tmp_path / "episodes.parquet")
+    files = {"data_files": str(tmp_path / "episodes.parquet"), "split": "train"}
+    for read in (
+        datasets.load_from_disk(tmp_path / "disk"),
+        datasets.Dataset.from_parquet(str(tmp_path / "episodes.parquet"), cache_dir=cache),
+        datasets.load_dataset("parquet", streaming=True, cache_dir=cache, **files),
+        dataset.to_iterable_dataset(),
+        dataset.with_format("numpy"),
+        dataset.cast_column("frames", datasets.Sequence(datasets.Image(decode=False))),
+        (dict(row) for row in dataset),
+    ):
+        assert same(from_huggingface(read), demos)
+
+
+def test_only_the_two_columns_are_read(demos, tmp_path):
+    dataset = to_huggingface(demos, cache_dir=tmp_path / "cache")
+    dataset = dataset.rename_columns({"frames": "video", "instruction": "task"})
+    broken = [{"bytes": b"no picture", "path": None}] * len(dataset)
+    dataset = dataset.add_column("action", broken).cast_column("action", datasets.Image())
+    with pytest.raises(OSError, match="identify"):
+        dataset[0]
+    assert same(from_huggingface(dataset, frames="video", instruction="task"), demos)
+
+
+def test_arrays_and_grey_pictures_are_read():
+    frames = np.arange(2 * 3 * 16 * 24, dtype=np.uint8).reshape(2, 3, 16, 24)
+    grey = [Image.fromarray(frame[0]) for frame in frames]
+    assert np.array_equal(
+        all_frames(from_huggingface([{"frames": frames, "instruction": "go"}], close=False)), frames
+    )
+    demos = from_huggingface([{"frames": grey, "instruction": "go"}])
+    assert demos.image_shape == (3, 16, 24)
+    assert np.array_equal(all_frames(demos)[:2, 1], frames[:, 0])
+
+
+GOOD = {"frames": [Image.new("RGB", (24, 16), c) for c in ("red", "blue")], "instruction": "go"}
+
+
+@pytest.mark.parametrize(
+    ("dataset", "said"),
+    [
+        ({"train": [GOOD], "test": [GOOD]}, r"one of the splits: .* with 'train', 'test'"),
+        ([], "there is no episode"),
+        ([GOOD, {"frames": GOOD["frames"]}], "episode 1 has no instruction"),
+        ([GOOD, GOOD | {"instruction": ""}], "episode 1 has no instruction"),
+        ([GOOD, GOOD | {"frames": []}], "episode 1 is .* at least one frame"),
+        ([GOOD, GOOD | {"frames": GOOD["frames"][:1]}], "episode 1 has 1 frame"),
+        (
+            [GOOD, GOOD | {"frames": [*GOOD["frames"], Image.new("RGB", (8, 8))]}],
+            "episode 1: frame 2 has 8x8 pixels, the first frame has 24x16",
+        ),
+        ([GOOD, GOOD | {"frames": [Image.new("F", (24, 16))] * 2}], "episode 1: frame 0 .* 'F'"),
+        ([GOOD, GOOD | {"frames": [{"bytes": b"?"}] * 2}], "episode 1: frame 0 cannot be read"),
+        (datasets.Dataset.from_dict({"video": [1]}), "no column 'frames', but video: name it with"),
+    ],
+)
+def test_what_is_wrong_is_said_with_the_number_of_the_row(dataset, said):
+    with pytest.raises(UserError, match=said):
+        from_huggingface(dataset)
+
+
+def test_a_picture_that_datasets_cannot_decode_names_its_row(tmp_path):
+    rows = [GOOD, GOOD, GOOD | {"frames": [{"bytes": b"no picture", "path": None}] * 2}]
+    features = {
+        "frames": datasets.Sequence(datasets.Image()),
+        "instruction": datasets.Value("string"),
+    }
+    dataset = datasets.Dataset.from_list(rows, features=datasets.Features(features))
+    with pytest.raises(UserError, match="episode 2 cannot be read"):
+        from_huggingface(dataset)
+
+
+def test_demonstrations_that_are_no_pictures_are_refused():
+    frames = [torch.zeros(2, 2, 16, 24, dtype=torch.uint8)]
+    with pytest.raises(UserError, match="these frames have 2"):
+        to_huggingface(Demonstrations.from_arrays(frames, ["go"]))
+    tokens = torch.ones(1, 1).long()
+    with pytest.raises(UserError, match="without a vocabulary"):
+        to_huggingface(Demonstrations.from_arrays([frames[0][:, :1]], tokens))

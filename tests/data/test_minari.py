@@ -1,0 +1,207 @@
+import shutil
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+import torch
+from gymnasium import spaces
+
+from ifo_grounding.data import Demonstrations, from_minari, record_demonstrations, to_minari
+from ifo_grounding.errors import UserError
+from ifo_grounding.tasks import VOCABULARY
+
+minari = pytest.importorskip("minari", reason="the extra minari needs Python 3.11")
+h5py = pytest.importorskip("h5py")
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*None")
+BOX = spaces.Box(0, 255, (40, 48, 3), np.uint8)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari"
+
+
+@pytest.fixture
+def demos():
+    return record_demonstrations("move", 12, seed=0)
+
+
+def all_frames(demos):
+    return demos.frames(torch.arange(demos.n_frames))
+
+
+def test_a_dataset_comes_back_as_it_was(demos, folder):
+    written = to_minari(demos, "mine/move-v0", author="me")
+    assert written.total_episodes == 12
+    back = from_minari("mine/move-v0", vocabulary=VOCABULARY)
+    assert back.sentences() == demos.sentences()
+    assert torch.equal(back.lengths, demos.lengths)
+    assert torch.equal(all_frames(back), all_frames(demos))
+    assert from_minari(written).vocabulary.words == tuple(
+        sorted(set(" ".join(demos.sentences()).split()))
+    )
+
+
+def test_placeholders_stand_for_actions_and_the_metadata_says_so(demos):
+    to_minari(demos, "move-v0")
+    dataset = minari.load_dataset("move-v0")
+    assert dataset.storage.metadata["actions_absent"] is True
+    assert "actions and rewards are absent" in dataset.storage.metadata["description"]
+    assert dataset.action_space == spaces.Discrete(1)
+    for number, episode in enumerate(dataset):
+        assert not episode.actions.any() and not episode.rewards.any()
+        assert len(episode.actions) == demos.lengths[number] - 1
+        assert episode.observations["mission"] == [demos.sentences()[number]] * len(
+            episode.observations["image"]
+        )
+        assert episode.observations["image"][0] in dataset.observation_space["image"]
+
+
+def another(name, n=4, space=None, make=None, **storing):
+    """Make a dataset with real actions, such as somebody else would."""
+    space = space or spaces.Dict({"view": BOX, "mission": spaces.Text(9)})
+    make = make or (lambda views, n: {"view": views, "mission": [f"go {'on' * n}"] * len(views)})
+    draw = np.random.default_rng(0)
+    views = [draw.integers(256, size=(3 + k, *BOX.shape), dtype=np.uint8) for k in range(n)]
+    buffers = [
+        minari.data_collector.EpisodeBuffer(
+            observations=make(shown, number),
+            actions=np.arange(1, len(shown)),
+            rewards=[1.0] * (len(shown) - 1),
+            terminations=[False] * (len(shown) - 1),
+            truncations=[True] * (len(shown) - 1),
+        )
+        for number, shown in enumerate(views)
+    ]
+    storing = {"jpeg_encoding": False, **storing}
+    dataset = minari.create_dataset_from_buffers(
+        name, buffers, observation_space=space, action_space=spaces.Discrete(20), **storing
+    )
+    return dataset, [views.transpose(0, 3, 1, 2) for views in views]
+
+
+@pytest.mark.parametrize("kind", ["hdf5", "arrow", "parquet"])
+@pytest.mark.parametrize("jpeg", [False, True])
+def test_datasets_of_others_are_read_as_they_were_recorded(kind, jpeg):
+    dataset, views = another("other-v0", n=2, data_format=kind, jpeg_encoding=jpeg)
+    make = lambda views, _: views  # noqa: E731
+    alone, _ = another("alone-v0", 2, BOX, make, data_format=kind, jpeg_encoding=jpeg)
+    alone.storage.update_metadata({"task": "go on"})
+    for demos in (
+        from_minari(dataset, image="view", close=False),
+        from_minari(alone, image=None, instruction="task", close=False),
+    ):
+        shown = all_frames(demos).numpy()
+        assert shown.shape == (7, 3, 40, 48)
+        if jpeg:  # a lossy format: noise comes back as other noise
+            expected = np.concatenate([one.observations for one in alone]).transpose(0, 3, 1, 2)
+        else:
+            expected = np.concatenate(views)
+        assert np.array_equal(shown, expected)
+
+
+def test_actions_are_never_read(folder):
+    """A file without actions, which Minari itself cannot read, gives the same demonstrations."""
+    whole, _ = another("other-v0")
+    expected = from_minari(whole, image="view")
+    path = folder / "other-v0" / "data" / "main_data.hdf5"
+    with h5py.File(path, "a") as file:
+        for episode in file.values():
+            for name in ("actions", "rewards", "terminations", "truncations"):
+                del episode[name]
+    with pytest.raises(KeyError):
+        whole[0]
+    assert torch.equal(all_frames(from_minari(whole, image="view")), all_frames(expected))
+
+    table, _ = another("table-v0", data_format="parquet")
+    for path in (folder / "table-v0" / "data").glob("*/*.parquet"):
+        pyarrow.parquet.write_table(
+            pyarrow.parquet.read_table(path, columns=["observations"], partitioning=None), path
+        )
+    with pytest.raises(KeyError):
+        table[0]
+    assert torch.equal(all_frames(from_minari(table, image="view")), all_frames(expected))
+
+
+def test_a_part_of_a_dataset_is_read():
+    dataset, views = another("other-v0")
+    long = dataset.filter_episodes(lambda episode: len(episode.rewards) > 3)
+    demos = from_minari(long, image="view")
+    assert demos.lengths.tolist() == [6, 7]  # of 5 and 6 frames, and the stop
+    assert np.array_equal(demos.first_frames().numpy(), np.stack([views[2][0], views[3][0]]))
+
+
+def test_the_instruction_may_be_in_the_metadata_of_an_episode():
+    make = lambda views, _: {"view": views}  # noqa: E731
+    dataset, _ = another("other-v0", 3, spaces.Dict({"view": BOX}), make)
+    for number in range(3):
+        dataset.storage.update_episode_metadata([{"task": f"step {number}"}], [number])
+    demos = from_minari(dataset, image="view", instruction="task")
+    assert demos.sentences() == ["step 0", "step 1", "step 2"]
+
+
+def test_grey_and_channels_first_images_are_read():
+    grey = spaces.Dict({"view": spaces.Box(0, 255, (40, 48), np.uint8), "mission": spaces.Text(9)})
+    make = lambda views, _: {"view": views[..., 0], "mission": ["go"] * len(views)}  # noqa: E731
+    demos = from_minari(another("grey-v0", space=grey, make=make)[0], image="view")
+    assert demos.image_shape == (1, 40, 48)
+    first = spaces.Dict({"view": spaces.Box(0, 255, (3, 40, 48), np.uint8)})
+    make = lambda views, _: {"view": views.transpose(0, 3, 1, 2)}  # noqa: E731
+    dataset, views = another("first-v0", space=first, make=make)
+    dataset.storage.update_metadata({"mission": "go on"})
+    assert np.array_equal(from_minari(dataset, image="view").first_frames()[1], views[1][0])
+
+
+def changing(views, number):
+    sentences = ["go on"] * len(views)
+    sentences[-1] = "go back" if number == 1 else "go on"
+    return {"view": views, "mission": sentences}
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "said"),
+    [
+        (None, {"image": "image"}, r"no image 'image' in the observation \(\['mission', 'view'\]"),
+        (None, {"image": "mission"}, "no image 'mission'"),
+        (None, {"image": None}, "no image None"),
+        (None, {"instruction": "task"}, r"no instruction 'task' .* episode 0: name it"),
+        (changing, {}, "episode 1 has 2 instructions"),
+        (lambda views, n: {"view": views, "mission": [""] * len(views)}, {}, "episode 0 has no in"),
+    ],
+)
+def test_what_does_not_fit_is_said(make, options, said):
+    dataset, _ = another("other-v0", make=make)
+    with pytest.raises(UserError, match=said):
+        from_minari(dataset, **{"image": "view", **options})
+
+
+def test_damaged_and_missing_datasets_are_refused(folder):
+    with pytest.raises(UserError, match="nothing-v0 not found locally"):
+        from_minari("nothing-v0")
+    dataset, _ = another("other-v0")
+    path = folder / "other-v0" / "data" / "main_data.hdf5"
+    with h5py.File(path, "a") as file:
+        del file["episode_2"]
+    with pytest.raises(UserError, match="episode 2 cannot be read"):
+        from_minari(dataset, image="view")
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(UserError, match="data cannot be read"):
+        from_minari(dataset, image="view")
+
+
+def test_nothing_half_written_stays_behind(demos, folder):
+    with pytest.raises(UserError, match=r"'no name' cannot be written: Malformed"):
+        to_minari(demos, "no name")
+    with pytest.raises(TypeError, match="colour"):
+        to_minari(demos, "move-v0", colour="red")
+    assert not any(folder.iterdir())
+    to_minari(demos[:2], "move-v0")
+    with pytest.raises(UserError, match="'move-v0' exists: choose another name or version"):
+        to_minari(demos, "move-v0")
+    assert len(from_minari("move-v0")) == 2
+    shutil.rmtree(folder)
+    frames = [torch.zeros(2, 2, 16, 24, dtype=torch.uint8)]
+    with pytest.raises(UserError, match="these frames have 2"):
+        to_minari(Demonstrations.from_arrays(frames, ["go"]), "move-v0")
