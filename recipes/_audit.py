@@ -30,13 +30,14 @@ def audit_callback(
     scenes = {"seed": options.evaluate.seed, "stream": "validation"}
     episodes = options.evaluate.audit_episodes
     place, shown = world.played(episodes, **scenes)
+    waiting, _ = world.played(episodes, waits=True, **scenes)
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
     pool = load_demonstrations(run).pool()
 
     def audit(step: int) -> dict[str, float]:
         result = success_rate(policy, place, mode="both", **shown)
         assert result.sampled is not None
-        played = return_correlation(policy, reward, place, **shown)
+        played = return_correlation(policy, reward, waiting, **shown)
         return {
             "success": result.rate.rate,
             "success_low": result.rate.low,

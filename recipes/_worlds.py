@@ -66,8 +66,8 @@ class Grid:
         """Record demonstrations, and apart from them what only evaluation may read."""
         return record_demonstrations(self.task, n, keep_truth=True, **self.arguments(**chosen))
 
-    def played(self, episodes: int, **chosen: Any) -> Played:
-        """Return where to play instructed episodes."""
+    def played(self, episodes: int, *, waits: bool = False, **chosen: Any) -> Played:
+        """Return where to play instructed episodes; a fulfilled instruction ends none of them."""
         return self.task, {"episodes": episodes, **self.arguments(**chosen)}
 
     def pictured(self, scenes: list[int], **chosen: Any) -> Played:
@@ -89,11 +89,11 @@ class BabyAI:
     def __init__(self, options: DictConfig) -> None:
         self.options, self.level = options, options.task
         self.tile_size: int = options.world.tile_size
-        self.processes: int = options.processes or len(os.sched_getaffinity(0))
+        self.processes: int = options.processes or os.cpu_count() or 1
 
     def simulator(self, num_envs: int = 1) -> GymnasiumEnv:
         """Return rooms without missions: all that a learner may step."""
-        return self._rooms(num_envs, self.options.seed, "training", instructed=False)
+        return self._rooms(num_envs, self.options.seed, "training", mission="none")
 
     def demonstrate(self, n: int, **chosen: Any) -> tuple[Demonstrations, Truth]:
         """Let the bot demonstrate, and keep its actions apart."""
@@ -101,11 +101,12 @@ class BabyAI:
         return record_babyai(self.level, n, keep_truth=True, **settings)
 
     def played(
-        self, episodes: int, *, seed: int, stream: str, split: str = "all", **chosen: Any
+        self, episodes: int, *, seed: int, stream: str, split: str = "all", waits: bool = False
     ) -> Played:
-        """Return rooms with their missions."""
+        """Return rooms with their missions, which end with them unless they are to wait."""
         check_choice("evaluate.split of BabyAI", split, ["all"])
-        rooms = self._rooms(min(episodes, ROOMS), seed, stream)
+        mission = "waits" if waits else "ends"
+        rooms = self._rooms(min(episodes, ROOMS), seed, stream, mission)
         return rooms, {"episodes": episodes, "seed": seed, "stream": stream, **UNTIL_THE_END}
 
     def pictured(self, scenes: list[int], *, seed: int, stream: str, **chosen: Any) -> Played:
@@ -119,16 +120,14 @@ class BabyAI:
             self.level, episodes, seed=seed, stream=stream, processes=self.processes, **chosen
         )
 
-    def _rooms(
-        self, num_envs: int, seed: int, stream: str, instructed: bool = True
-    ) -> GymnasiumEnv:
+    def _rooms(self, num_envs: int, seed: int, stream: str, mission: str = "ends") -> GymnasiumEnv:
         words = load_demonstrations(open_run(self.options)).vocabulary
         assert words is not None
         return from_gymnasium(
-            babyai(self.level, self.tile_size, missions=instructed),
+            babyai(self.level, self.tile_size, mission),
             vocabulary=words,
             num_envs=num_envs,
-            instructed=instructed,
+            instructed=mission != "none",
             stop=self.stop,
             skip_unknown=True,  # no demonstration taught them
             seed=seed,

@@ -137,7 +137,7 @@ def evaluate_judges(policy: Any, run: Run, world: World) -> dict[str, Any]:
     results: dict[str, Any] = {}
     options = world.options
     audited = evaluation_scenes(options)
-    place, shown = world.played(options.evaluate.audit_episodes, **audited)
+    place, shown = world.played(options.evaluate.audit_episodes, waits=True, **audited)
     if (run / REWARD).exists():
         judge = load_network(run, REWARD, "train_reward", options)
         if world.oracle:

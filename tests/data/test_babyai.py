@@ -79,17 +79,20 @@ def test_a_picture_is_minigrid_s_own_and_shows_what_is_carried():
     assert np.array_equal(seen[16:], plain[16:]) and np.array_equal(seen[:, 16:], plain[:, 16:])
 
 
-def test_rooms_without_missions_go_on():
-    _, truth = record_babyai("GoToObj", 1, seed=0, keep_truth=True)
-    seed = derive(0, "babyai", "GoToObj training", 0) % 2**31
+@pytest.mark.parametrize("level", ["GoToObj", "PickupLoc"])
+def test_what_becomes_of_a_room_whose_mission_is_fulfilled(level):
+    _, truth = record_babyai(level, 1, seed=0, keep_truth=True)
+    seed = derive(0, "babyai", f"{level} training", 0) % 2**31
     ends = {}
-    for missions in (True, False):
-        room = babyai("GoToObj", missions=missions)()
+    for mission in ("ends", "waits", "none"):
+        room = babyai(level, mission=mission)()
         room.reset(seed=seed)
-        steps = [room.step(action) for action in truth.actions.tolist()[:-1]]
-        ends[missions] = [(reward > 0, terminated) for _, reward, terminated, _, _ in steps]
-    assert ends[True] == [*[(False, False)] * (len(steps) - 1), (True, True)]
-    assert not any(flag for end in ends[False] for flag in end)
+        steps = [room.step(action) for action in truth.actions.tolist()]
+        ends[mission] = [(reward > 0, terminated) for _, reward, terminated, _, _ in steps]
+    quiet = [(False, False)] * (len(truth.actions) - 2)
+    assert ends["ends"][:-1] == [*quiet, (True, True)]
+    assert ends["waits"] == [*quiet, (False, False), (True, False)]
+    assert ends["none"] == [(False, False)] * len(truth.actions)
 
 
 def test_the_bot_plays_the_rooms_of_the_environment():

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.from_gymnasium import world_seed
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -28,6 +28,7 @@ BABYAI_ACTIONS = ("left", "right", "forward", "pickup", "drop", "toggle", "done"
 """MiniGrid's actions."""
 DONE = BABYAI_ACTIONS.index("done")
 """The action that does nothing: how a policy says that it is done."""
+MISSIONS = ("ends", "waits", "none")
 LENGTH = 32
 """Words of the longest mission of one room."""
 PATIENCE = 3
@@ -36,7 +37,7 @@ PATIENCE = 3
 Make = Callable[[], gymnasium.Env]
 
 
-def babyai(level: str, tile_size: int = 8, missions: bool = True) -> Make:
+def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
     """Return a function that makes a level of BabyAI whose whole room is seen as a picture.
 
     What the agent carries is seen in the top left corner, so that a picture shows all there is.
@@ -44,12 +45,14 @@ def babyai(level: str, tile_size: int = 8, missions: bool = True) -> Make:
     Args:
         level: such as ``GoToObj``, ``GoToLocal`` or ``PickupLoc``, or a full id.
         tile_size: pixels along one side of a cell.
-        missions: whether a room pays for its mission and ends with it. Without, it goes on: a
-            learner practises what it chooses itself.
+        mission: what becomes of a room whose mission is fulfilled. It ``ends`` and pays, as BabyAI
+            has it; it ``waits`` until the policy is done, and then pays; or there is ``none``, and
+            the room goes on: a learner practises what it chooses itself.
 
     Raises:
         UserError: where minigrid is missing, or there is no such level.
     """
+    check_choice("mission", mission, MISSIONS)
     name = level if level.endswith(("-v0", "-v1")) else f"BabyAI-{level}-v0"
     try:
         import minigrid  # noqa: F401  (registers the levels)
@@ -58,42 +61,45 @@ def babyai(level: str, tile_size: int = 8, missions: bool = True) -> Make:
     if name not in gymnasium.registry:
         known = sorted(i[7:-3] for i in gymnasium.registry if i.startswith("BabyAI-"))
         raise UserError(f"there is no level {name!r}: choose among {', '.join(known)}")
-    return functools.partial(_make, name, tile_size, missions)
+    return functools.partial(_make, name, tile_size, mission)
 
 
-def _make(name: str, tile_size: int, missions: bool) -> gymnasium.Env:
+def _make(name: str, tile_size: int, mission: str) -> gymnasium.Env:
     import minigrid  # noqa: F401
 
     # The observation is another than the one declared, which the checker would refuse.
-    return _Room(gymnasium.make(name, disable_env_checker=True), tile_size, missions)
+    return _Room(gymnasium.make(name, disable_env_checker=True), tile_size, mission)
 
 
 class _Room(gymnasium.Wrapper):
     """Shows a level's whole room, and keeps it from printing whenever it draws a room anew."""
 
-    def __init__(self, env: gymnasium.Env, tile_size: int, missions: bool) -> None:
+    def __init__(self, env: gymnasium.Env, tile_size: int, mission: str) -> None:
         super().__init__(env)
-        self.tile_size, self.missions = tile_size, missions
+        self.tile_size, self.mission, self._earned = tile_size, mission, 0.0
         level: Any = env.unwrapped
         # In place of what the agent sees, whose computation takes longer than all else.
         level.gen_obs = self._look
         self.level = level
         size = (level.height * tile_size, level.width * tile_size, 3)
         image = gymnasium.spaces.Box(0, 255, size, np.uint8)
-        mission = level.observation_space["mission"]
-        self.observation_space = gymnasium.spaces.Dict({"image": image, "mission": mission})
+        words = level.observation_space["mission"]
+        self.observation_space = gymnasium.spaces.Dict({"image": image, "mission": words})
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in a new room."""
+        self._earned = 0.0
         with redirect_stdout(StringIO()):
             return self.env.reset(**options)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Take an action; without missions nothing but the room's time limit ends an episode."""
+        """Take an action; a room that does not end with its mission ends with its time."""
         seen, reward, terminated, truncated, info = self.env.step(action)
-        if not self.missions:
-            reward, terminated = 0.0, False
-        return seen, float(reward), terminated, truncated, info
+        if self.mission == "ends":
+            return seen, float(reward), terminated, truncated, info
+        self._earned = max(self._earned, float(reward))
+        pays = self.mission == "waits" and (int(action) == DONE or truncated)
+        return seen, self._earned if pays else 0.0, False, truncated, info
 
     def _look(self) -> dict[str, Any]:
         return {"image": self._picture(), "mission": self.level.mission}
