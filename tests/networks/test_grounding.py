@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 
 from ifo_grounding.data import labelled_buffer, record_demonstrations
@@ -130,3 +131,17 @@ def test_pairs_that_no_demonstration_names_are_followed():
     scenes = {"episodes": 1000, "stream": "validation", "holdout": "validation-3"}
     found = episode_endings(loss.network, "move", split="zero-shot", **scenes)
     assert found.counts["success"] > 800
+
+
+def test_padding_says_nothing(shapes):
+    policy = make_policy(shapes, "grounded", seed=0).eval()
+    tokens = VOCABULARY.encode(["move to the red circle", "put the blue diamond in the green box"])
+    image = tiles("red circle", "blue triangle").expand(2, -1, -1, -1)
+
+    def logits(words):
+        given = TensorDict({"pixels": image[: len(words)], "instruction": words}, [len(words)])
+        return policy(given)["logits"]
+
+    both = logits(tokens)
+    torch.testing.assert_close(logits(tokens[:1]), both[:1])
+    torch.testing.assert_close(logits(F.pad(tokens, (0, 9))), both)

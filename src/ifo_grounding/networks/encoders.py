@@ -188,7 +188,7 @@ class InstructionEncoder(nn.Module):
         if not distinct.numel():
             return self.embedding.weight.new_zeros(len(distinct), self.size), inverse
         check_tokens(distinct, self.embedding.num_embeddings)
-        longest = max(int(_lengths(distinct).max()), 1)
+        longest = max(int(sentence_lengths(distinct).max()), 1)
         return self._encode(distinct[:, :longest]), inverse
 
     def _encode(self, tokens: Tensor) -> Tensor:
@@ -214,13 +214,13 @@ class ConvInstructionEncoder(InstructionEncoder):
     def _encode(self, tokens: Tensor) -> Tensor:
         """Encode rows of ids [N, L], of which trailing zeros do not count."""
         step = torch.arange(tokens.shape[1], device=tokens.device)
-        alive = (step < _lengths(tokens).unsqueeze(1)).unsqueeze(-1)
+        alive = (step < sentence_lengths(tokens).unsqueeze(1)).unsqueeze(-1)
         words = self.embedding(tokens) * alive
-        words = F.relu(_over_words(self.first, words)) * alive
-        return self.out((F.relu(_over_words(self.second, words)) * alive).amax(-2))
+        words = F.relu(over_words(self.first, words)) * alive
+        return self.out((F.relu(over_words(self.second, words)) * alive).amax(-2))
 
 
-def _over_words(layer: nn.Conv1d, words: Tensor) -> Tensor:
+def over_words(layer: nn.Conv1d, words: Tensor) -> Tensor:
     """Convolve [N, L, D] over its words, as an image of one row: on a CPU nearly twice as fast."""
     row = words.movedim(-1, -2).unsqueeze(-2)  # [N, D, 1, L], channels last in memory
     padding = (0, layer.kernel_size[0] // 2)
@@ -254,7 +254,7 @@ class GRUInstructionEncoder(InstructionEncoder):
 
     def _encode(self, tokens: Tensor) -> Tensor:
         """Run the GRU both ways over rows of ids [N, L], of which trailing zeros do not count."""
-        lengths = _lengths(tokens)
+        lengths = sentence_lengths(tokens)
         step = torch.arange(tokens.shape[1], device=tokens.device)
         backward = tokens.gather(1, (lengths.unsqueeze(1) - 1 - step).clamp_min(0))
         table = torch.baddbmm(
@@ -277,7 +277,7 @@ class GRUInstructionEncoder(InstructionEncoder):
         return torch.lerp(candidate, state, keep)
 
 
-def _lengths(tokens: Tensor) -> Tensor:
+def sentence_lengths(tokens: Tensor) -> Tensor:
     """Return the number of ids of each row up to the last that is not padding."""
     place = torch.arange(1, tokens.shape[-1] + 1, device=tokens.device)
     return torch.where(tokens != 0, place, 0).amax(-1)

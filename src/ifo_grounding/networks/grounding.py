@@ -22,7 +22,9 @@ from ifo_grounding.networks.encoders import (
     as_float,
     check_tokens,
     distinct_patches,
+    over_words,
     patches,
+    sentence_lengths,
 )
 from ifo_grounding.networks.fusion import cell_places
 from ifo_grounding.networks.shapes import Shapes, patch_size
@@ -172,14 +174,13 @@ class WordMaps(nn.Module):
         alive = (tokens != 0).unsqueeze(-1)
         heard = swap_words(tokens, self.swapped) if self.training else tokens
         code = torch.tanh(self.role(heard)) * alive
-        beside = F.relu(self.beside(code.movedim(-1, -2)))
-        relevance = self.relevance(beside).movedim(-2, -1).softmax(-1)
+        beside = F.relu(over_words(self.beside, code)) * alive
+        relevance = over_words(self.relevance, beside).softmax(-1)
         side = torch.tanh(self.side(tokens))
         if self.training:
             side = side + self.noise * torch.randn_like(side)
-        around = F.relu(self.around((side * alive).movedim(-1, -2)))
-        manner = self.manner((around * alive.movedim(-1, -2)).amax(-1))
-        return self.relevance.out_channels * relevance * alive, manner
+        around = F.relu(over_words(self.around, side * alive)) * alive
+        return self.relevance.out_channels * relevance * alive, self.manner(around.amax(-2))
 
 
 def swap_words(tokens: Tensor, share: float) -> Tensor:
@@ -238,6 +239,7 @@ class GroundedTrunk(nn.Module):
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
         if tokens.numel() and not hidden_from_python(tokens):
             check_tokens(tokens, self.words.role.num_embeddings)
+            tokens = tokens[:, : max(int(sentence_lengths(tokens).max()), 1)]
         looks = self.looks(image)
         logits, manner = self.words(looks, tokens.long())
         maps = self.weigh(logits)
