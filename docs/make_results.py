@@ -37,8 +37,8 @@ NAMES = {
 LEVELS = [("GoToObj", 1000), ("GoToLocal", 1000), ("PickupLoc", 1000), ("PutNextLocal", 1000)]
 """Levels of BabyAI and numbers of demonstrations that the page speaks of, run or not."""
 
-Key = tuple[str, int, str]
-"""Of a study: task, demonstrations, preset and variant."""
+Key = tuple[str, int, str, float]
+"""Of a study: task, demonstrations, preset and variant, and the share held out."""
 
 
 def runs() -> list[dict[str, Any]]:
@@ -48,14 +48,15 @@ def runs() -> list[dict[str, Any]]:
 
 
 def studies() -> dict[Key, list[dict[str, Any]]]:
-    """Return the committed seeds of each study: task, demonstrations, preset and variant."""
+    """Return the committed seeds of each study."""
     found: dict[Key, list[dict[str, Any]]] = {}
     for path in sorted((ROOT / "results" / "study").glob("*.json")):
         run = read_json(path)
         options = run["options"]
         variant = options.get("variant")
         kind = f"{options['network']}, {variant}" if variant else options["network"]
-        key = (options["task"], options["demonstrations"]["n"], kind)
+        held_out = options["imitate"].get("held_out", 0.0)
+        key = (options["task"], options["demonstrations"]["n"], kind, held_out)
         found.setdefault(key, []).append(run)
     return dict(sorted(found.items(), key=lambda item: (TASKS.index(item[0][0]), item[0][1:])))
 
@@ -113,7 +114,7 @@ def module_section() -> list[str]:
         if "phase2" not in runs[0]["results"] and "suitability" in runs[0]["results"]
     }
     rows = []
-    for (task, n, kind), runs in found.items():
+    for (task, n, kind, _), runs in found.items():
         for run in runs:
             suitability = run["results"]["suitability"]
             rows.append(
@@ -146,7 +147,7 @@ def imitation_section() -> list[str]:
         if not {"phase2", "suitability"} & set(runs[0]["results"])
     }
     rows = []
-    for (task, n, kind), runs in found.items():
+    for (task, n, kind, _), runs in found.items():
         for run in runs:
             success, options = run["results"]["phase1"], run["options"]
             rows.append(
@@ -179,7 +180,7 @@ def babyai_section() -> list[str]:
         run = read_json(path)
         level = (run["options"]["task"], run["options"]["demonstrations"]["n"])
         found.setdefault(level, []).append(run)
-    ran = {(*level, ""): runs for level, runs in found.items() if runs}
+    ran = {(*level, "", 0.0): runs for level, runs in found.items() if runs}
     return [
         "## BabyAI",
         "Greedy success by BabyAI's own reward in fixed rooms, in percent, with 95% intervals over"
@@ -220,7 +221,7 @@ def practised(variants: bool = False) -> dict[Key, list[dict[str, Any]]]:
 
 def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dict[str, Any]:
     """Compare the policies of one study over its seeds."""
-    task, n, kind = key
+    task, n, kind, held_out = key
     both = outcomes(runs, "phase1"), outcomes(runs, "phase2")
     stream = f" {runs[0]['options']['evaluate']['stream']}" if scenes else ""
     row = {
@@ -229,7 +230,7 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
         "preset": kind,
         "seeds": len(runs),
         "scenes": f"{both[0].shape[1]:,}{stream}",
-        "held out": f"{runs[0]['options']['imitate'].get('held_out', 0):.0%}",
+        "held out": f"{held_out:.0%}",
         "phase 1": brief(two_level_bootstrap(both[0])),
         "phase 2": brief(two_level_bootstrap(both[1])),
         "gain, points": brief(paired_difference(*both)),
@@ -248,7 +249,7 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
 
 def adjusted(found: dict[Key, list[dict[str, Any]]]) -> list[str]:
     """Return the p-value of each study's gain, corrected for all with as many demonstrations."""
-    groups: dict[tuple[int, str], list[Key]] = {}
+    groups: dict[tuple[int, str, float], list[Key]] = {}
     for key in found:
         groups.setdefault(key[1:], []).append(key)
     corrected = {}
@@ -274,9 +275,10 @@ def commands(found: dict[Key, list[dict[str, Any]]]) -> str:
 def study_picture() -> Figure:
     """Draw what the studies compare."""
     groups = {}
-    for (task, n, kind), runs in practised().items():
+    for (task, n, kind, held_out), runs in practised().items():
         known = [name for name in NAMES if all(name in run["results"] for run in runs)]
-        title = f"{task}, {n:,} demonstrations, {kind}, seeds: {len(runs)}"
+        aside = f", {held_out:.0%} held out" if held_out else ""
+        title = f"{task}, {n:,} demonstrations{aside}, {kind}, seeds: {len(runs)}"
         groups[title] = {NAMES[name]: two_level_bootstrap(outcomes(runs, name)) for name in known}
     return compared_rates(groups)
 
@@ -310,7 +312,7 @@ def page(found: list[dict[str, Any]]) -> str:
 
 def readme(text: str) -> str:
     """Return the README with its table of results renewed."""
-    shown = ("task", "demonstrations", "seeds", "phase 1", "phase 2")
+    shown = ("task", "demonstrations", "held out", "seeds", "phase 1", "phase 2")
     against = ("over continued", "over cloned")
     rows = [{name: row[name] for name in (*shown, *against)} for row in study_rows()]
     return renewed(text, "results", f"\n{markdown_table(rows)}\n")
