@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.container import BarContainer
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from ifo_grounding import keys
@@ -18,7 +20,6 @@ from ifo_grounding.report.theme import LIGHT, PALETTE
 
 MAPS = 8
 """Maps that are shown: the sharpest ones."""
-DPI = 80
 
 
 def trace_animation(
@@ -39,11 +40,8 @@ def trace_animation(
         fps: steps per second.
         hold: seconds for which the last step is shown.
     """
-    chosen = sharpest(trace.maps, MAPS)
-    pictures = [
-        _picture(step_figure(trace, step, chosen, actions)) for step in range(len(trace.maps))
-    ]
-    return gif(pictures, fps, hold)
+    board = _Board(trace, sharpest(trace.maps, MAPS), actions)
+    return gif([board.picture(step) for step in range(len(trace.maps))], fps, hold)
 
 
 def sharpest(maps: np.ndarray, count: int) -> np.ndarray:
@@ -58,75 +56,82 @@ def sharpest(maps: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.argsort(-peak, kind="stable")[:count])
 
 
-def step_figure(trace: Trace, step: int, maps: np.ndarray, actions: Sequence[str]) -> Figure:
-    """Draw one step of an episode: what is seen, likely, judged and attended to."""
-    episode = trace.episode
-    figure, _ = _figure(7.6, 5.4)
-    figure.clear()
-    figure.suptitle(episode.sentence, fontsize=12, fontweight="bold", color=LIGHT["ink"])
-    rows = figure.add_gridspec(2, 1, height_ratios=(3, 1.15))
-    top = rows[0].subgridspec(1, 3 if trace.rewards else 2)
-    _seen(figure.add_subplot(top[0]), trace, step, actions)
-    _actions(figure.add_subplot(top[1]), trace, step, actions)
-    if trace.rewards:
-        _rewards(figure.add_subplot(top[2]), trace, step)
-    below = rows[1].subgridspec(1, max(len(maps), 1))
-    for place, number in enumerate(maps):
-        _map(figure.add_subplot(below[place]), trace, step, int(number))
-    return figure
+class _Board:
+    """A figure that is laid out once and then shows step after step."""
 
+    def __init__(self, trace: Trace, maps: np.ndarray, actions: Sequence[str]) -> None:
+        self.trace, self.chosen, self.names = trace, maps, actions
+        self.figure, _ = _figure(7.6, 5.4)
+        self.figure.clear()
+        sentence = trace.episode.sentence
+        self.figure.suptitle(sentence, fontsize=12, fontweight="bold", color=LIGHT["ink"])
+        rows = self.figure.add_gridspec(2, 1, height_ratios=(3, 1.15))
+        top = rows[0].subgridspec(1, 3 if trace.rewards else 2)
+        self.seen = self.figure.add_subplot(top[0])
+        self.shown = [self._image(self.seen)]
+        self.bars = self._actions(self.figure.add_subplot(top[1]))
+        self.lines = self._judges(self.figure.add_subplot(top[2])) if trace.rewards else []
+        below = rows[1].subgridspec(1, max(len(maps), 1))
+        self.weights = [
+            self._map(self.figure.add_subplot(below[place]), int(number))
+            for place, number in enumerate(maps)
+        ]
 
-def _seen(axes: Axes, trace: Trace, step: int, actions: Sequence[str]) -> None:
-    episode, last = trace.episode, len(trace.episode.actions) - 1
-    action = actions[episode.actions[step]]
-    ending = ""
-    if step == last:
-        ending = ", success" if episode.success else ", failure"
-    _dress(axes, f"Step {step + 1}: {action}{ending}", grid="")
-    _image(axes, episode.frames[step])
+    def picture(self, step: int) -> Image.Image:
+        """Draw a step: what is seen, likely, judged and attended to."""
+        episode = self.trace.episode
+        ended = step == len(episode.actions) - 1
+        ending = f", {'success' if episode.success else 'failure'}" if ended else ""
+        action = int(episode.actions[step])
+        _dress(self.seen, f"Step {step + 1}: {self.names[action]}{ending}", grid="")
+        for image in self.shown:
+            image.set_data(episode.frames[step].transpose(1, 2, 0))
+        for number, bar in enumerate(self.bars):
+            bar.set_width(self.trace.probabilities[step, number])
+            bar.set_color(PALETTE[0] if number == action else "#B6BEC7")
+        for line, values in zip(self.lines, self.trace.rewards.values(), strict=True):
+            line.set_data(np.arange(1, step + 2), values[: step + 1])
+        for image, number in zip(self.weights, self.chosen, strict=True):
+            # The square root: a weight of a tenth can be seen, an even map is as good as blank.
+            shown = np.sqrt(self.trace.maps[step, number])
+            image.set_data(shown)
+            image.set_alpha(0.8 * shown)
+        canvas = self.figure.canvas
+        assert isinstance(canvas, FigureCanvasAgg)
+        canvas.draw()
+        self.figure.set_layout_engine("none")  # to lay it out once is enough
+        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
+    def _image(self, axes: Axes, alpha: float = 1.0) -> AxesImage:
+        frame = self.trace.episode.frames[0]
+        height, width = frame.shape[-2:]
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return axes.imshow(frame.transpose(1, 2, 0), alpha=alpha, extent=(0, width, height, 0))
 
-def _actions(axes: Axes, trace: Trace, step: int, names: Sequence[str]) -> None:
-    _dress(axes, "Probability of actions", grid="x")
-    chosen = int(trace.episode.actions[step])
-    colours = [PALETTE[0] if number == chosen else "#B6BEC7" for number in range(len(names))]
-    axes.barh(range(len(names)), trace.probabilities[step], color=colours)
-    axes.set_yticks(range(len(names)), names)
-    axes.invert_yaxis()
-    axes.set_xlim(0, 1)
+    def _actions(self, axes: Axes) -> BarContainer:
+        _dress(axes, "Probability of actions", grid="x")
+        bars = axes.barh(range(len(self.names)), self.trace.probabilities[0])
+        axes.set_yticks(range(len(self.names)), self.names)
+        axes.invert_yaxis()
+        axes.set_xlim(0, 1)
+        return bars
 
+    def _judges(self, axes: Axes) -> list[Line2D]:
+        _dress(axes, "What the judges say", "step", grid="y")
+        lines = [
+            axes.plot([], [], color=colour, marker="o", markersize=3, label=name)[0]
+            for name, colour in zip(self.trace.rewards, PALETTE, strict=False)
+        ]
+        axes.set_ylim(-0.03, 1.03)
+        axes.set_xlim(0.5, len(self.trace.episode.actions) + 0.5)
+        axes.legend(frameon=False, fontsize=9, loc="upper left", labelcolor=LIGHT["ink"])
+        return lines
 
-def _rewards(axes: Axes, trace: Trace, step: int) -> None:
-    _dress(axes, "What the judges say", "step", grid="y")
-    for (name, values), colour in zip(trace.rewards.items(), PALETTE, strict=False):
-        so_far = np.arange(1, step + 2)
-        axes.plot(so_far, values[: step + 1], color=colour, marker="o", markersize=3, label=name)
-    axes.set_ylim(-0.03, 1.03)
-    axes.set_xlim(0.5, len(trace.episode.actions) + 0.5)
-    axes.legend(frameon=False, fontsize=9, loc="upper left", labelcolor=LIGHT["ink"])
-
-
-def _map(axes: Axes, trace: Trace, step: int, number: int) -> None:
-    weights = trace.maps[step, number]
-    _dress(axes, grid="")
-    axes.set_title(f"map {number + 1}", fontsize=8, color=LIGHT["faint"])
-    height, width = trace.episode.frames.shape[-2:]
-    _image(axes, trace.episode.frames[step], alpha=0.35)
-    # The square root: a weight of a tenth can be seen, an even map stays as good as blank.
-    shown = np.sqrt(weights)
-    axes.imshow(
-        shown, cmap="Oranges", vmin=0, vmax=1, alpha=0.8 * shown, extent=(0, width, height, 0)
-    )
-
-
-def _image(axes: Axes, frame: np.ndarray, alpha: float = 1.0) -> None:
-    height, width = frame.shape[-2:]
-    axes.imshow(frame.transpose(1, 2, 0), alpha=alpha, extent=(0, width, height, 0))
-    axes.set_xticks([])
-    axes.set_yticks([])
-
-
-def _picture(figure: Figure) -> Image.Image:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return Image.open(buffer).convert("RGB")
+    def _map(self, axes: Axes, number: int) -> AxesImage:
+        _dress(axes, grid="")
+        axes.set_title(f"map {number + 1}", fontsize=8, color=LIGHT["faint"])
+        self.shown.append(self._image(axes, alpha=0.35))
+        weights = self.trace.maps[0, number]
+        extent = self.shown[-1].get_extent()
+        return axes.imshow(weights, cmap="Oranges", vmin=0, vmax=1, extent=extent)
