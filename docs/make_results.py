@@ -314,7 +314,11 @@ def readme(text: str) -> str:
     """Return the README with its table of results renewed."""
     shown = ("task", "demonstrations", "held out", "seeds", "phase 1", "phase 2")
     against = ("over continued", "over cloned")
-    rows = [{name: row[name] for name in (*shown, *against)} for row in study_rows()]
+    rows = [
+        {name: row[name] for name in (*shown, *against)}
+        for row in study_rows()
+        if row["preset"] == "strong"
+    ]
     return renewed(text, "results", f"\n{markdown_table(rows)}\n")
 
 
