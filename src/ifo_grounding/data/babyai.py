@@ -178,30 +178,28 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
     play = functools.partial(_play, babyai(level, tile_size))
     name = f"{level} {stream}"
     seeds = (derive(seed, "babyai", name, number) % 2**31 for number in range(PATIENCE * n))
-    found: list[_Played] = []
-    with (
-        tqdm(total=n, desc=f"record {level}", disable=not progress) as bar,
-        _mapper(processes) as run,
-    ):
-        for played in run(play, seeds):
-            if played is not None:
-                found.append(played)
+    actions: list[int] = []
+
+    def episodes() -> Iterator[tuple[int, np.ndarray, str]]:
+        solved = 0
+        bar = tqdm(total=n, desc=f"record {level}", disable=not progress)
+        with bar, _mapper(processes) as run:
+            for played in filter(None, run(play, seeds)):
+                yield solved, played.frames, played.mission
+                actions.extend(played.actions)
+                solved += 1
                 bar.update()
-            if len(found) == n:
-                break
-    if len(found) < n:
+                if solved == n:
+                    return
         raise UserError(
-            f"the bot solved {len(found)} of {PATIENCE * n} episodes of {level}: choose a level "
-            "that it can solve"
+            f"the bot solved {solved} of {PATIENCE * n} episodes of {level}: choose a level that "
+            "it can solve"
         )
-    missions = [played.mission for played in found]
-    words = vocabulary or Vocabulary.from_sentences(missions, LENGTH)
-    shown = (torch.from_numpy(played.frames) for played in found)
-    demos = Demonstrations.from_arrays(shown, missions, vocabulary=words, tile_size=tile_size)
-    if not keep_truth:
-        return demos
-    actions = itertools.chain.from_iterable(played.actions for played in found)
-    return demos, Truth(torch.tensor(list(actions), dtype=torch.uint8))
+
+    demos = Demonstrations.from_episodes(
+        episodes(), vocabulary=vocabulary, length=LENGTH, tile_size=tile_size, close=False
+    )
+    return (demos, Truth(torch.tensor(actions, dtype=torch.uint8))) if keep_truth else demos
 
 
 def bot_outcomes(

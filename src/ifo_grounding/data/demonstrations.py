@@ -121,6 +121,7 @@ class Demonstrations:
         episodes: Iterable[Episode],
         *,
         vocabulary: Vocabulary | None = None,
+        length: int | None = None,
         tile_size: int | None = None,
         close: bool = True,
     ) -> Demonstrations:
@@ -130,6 +131,8 @@ class Demonstrations:
             episodes: name, frames and instruction of each; frames are uint8 [T + 1, C, H, W], at
                 least two. A generator is read once.
             vocabulary: the words of the instructions; by default those that occur.
+            length: words that the longest instruction may have, without a vocabulary; by default
+                those of the longest that occurs.
             tile_size: of the codec; the cheapest one by default.
             close: whether to repeat the last frame of episodes that do not show their stop.
 
@@ -144,7 +147,7 @@ class Demonstrations:
         codec, codes = FrameCodec.compress(reader.pieces(episodes), tile_size)
         sentences = reader.sentences
         words = vocabulary or Vocabulary.from_sentences(
-            sentences, max(len(sentence.split()) for sentence in sentences)
+            sentences, length or max(len(sentence.split()) for sentence in sentences)
         )
         tokens = words.encode(sentences)
         return cls(codec, codes, torch.tensor(reader.lengths), tokens, vocabulary=words)
