@@ -182,6 +182,11 @@ def commands(found: Pieces) -> str:
         for runs in found.values()
         for run in runs
     ]
+    return folded(made)
+
+
+def folded(made: list[str]) -> str:
+    """Return lines about commands, folded away."""
     return "\n".join(['??? note "Commands"', "", *(f"    {line}" for line in made)]) if made else ""
 
 
@@ -281,7 +286,12 @@ def parts_content() -> str:
         run = read_json(path)
         found.setdefault(run["options"]["variant"], []).append(run)
     rows = [part_row(said, found[name]) for name, said in VARIANTS.items() if name in found]
-    return f"{table(rows)}\n\n{commands(found)}"
+    made = {
+        f"- `{run['command']}` (commit `{run['provenance']['commit']}`)"
+        for runs in found.values()
+        for run in runs
+    }
+    return "\n\n".join([table(rows), folded(sorted(made))])
 
 
 def part_row(said: str, runs: list[dict[str, Any]]) -> dict[str, str]:
