@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ifo_grounding.evaluation.endings import ENDINGS
+from ifo_grounding.evaluation.endings import ENDINGS, SHARED
 from ifo_grounding.files import atomic_write, read_json
 from ifo_grounding.report import markdown_table
 from ifo_grounding.report.results import brief, restored
@@ -229,11 +229,6 @@ def zero_shot_row(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
         sum(counts["success"] for counts in trained),
         sum(sum(counts.values()) for counts in trained),
     )
-    objects = HOLDOUTS[options["world"]["holdout"]]
-    each = {
-        name: [ends["by_object"][name] for ends in held_out if name in ends["by_object"]]
-        for name in objects
-    }
     row = {
         "task": options["task"],
         "preset": f"`{options['network']}`",
@@ -241,20 +236,15 @@ def zero_shot_row(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
         "seeds": str(len(runs)),
         "held-out pairs": brief(two_level_bootstrap(outcomes(runs, phase))),
         "trained pairs": brief(of_trained),
-        "each held-out pair": "<br>".join(
-            f"{name} {100 * sum(w for w, _ in won) / sum(n for _, n in won):.1f}%"
-            for name, won in each.items()
-            if won
-        ),
     }
+    for name in HOLDOUTS[options["world"]["holdout"]]:
+        each = [ends["by_object"][name] for ends in held_out if name in ends["by_object"]]
+        row[name] = f"{100 * sum(won for won, _ in each) / sum(of for _, of in each):.1f}%"
     total = sum(sum(ends["counts"].values()) for ends in held_out)
-    for name in FAILURES:
-        share = sum(ends["counts"][name] for ends in held_out) / total
-        row[name] = f"{100 * share:.1f}%"
-    shared = [
-        f"{sum(e['shared'][k] for e in held_out)} {k}" for k in ("colour", "shape", "neither")
-    ]
-    row["wrong objects share"] = ", ".join(shared)
+    shares = [100 * sum(ends["counts"][name] for ends in held_out) / total for name in FAILURES]
+    row[", ".join(FAILURES)] = ", ".join(f"{share:.1f}%" for share in shares)
+    alike = [f"{sum(ends['shared'][name] for ends in held_out)} {name}" for name in SHARED[1:]]
+    row["wrong objects share"] = ", ".join(alike)
     return row
 
 

@@ -7,7 +7,7 @@ pytest.importorskip("minigrid")
 from ifo_grounding.data import Truth, babyai, bot_outcomes, record_babyai
 from ifo_grounding.data.babyai import DONE
 from ifo_grounding.envs import from_gymnasium
-from ifo_grounding.envs.from_gymnasium import world_seed
+from ifo_grounding.envs.wrapping import world_seed
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 

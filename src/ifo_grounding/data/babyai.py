@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
-from ifo_grounding.envs.from_gymnasium import world_seed
+from ifo_grounding.envs.wrapping import world_seed
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
