@@ -26,6 +26,7 @@ def trace_animation(
     trace: Trace,
     *,
     actions: Sequence[str] = keys.ACTIONS,
+    steps: int = 30,
     fps: float = 1.5,
     hold: float = 3.0,
 ) -> bytes:
@@ -37,11 +38,13 @@ def trace_animation(
     Args:
         trace: from :func:`~ifo_grounding.evaluation.trace_episode`.
         actions: names of the actions.
+        steps: how many are shown at most, the last ones.
         fps: steps per second.
         hold: seconds for which the last step is shown.
     """
     board = _Board(trace, sharpest(trace.maps, MAPS), actions)
-    return gif([board.picture(step) for step in range(len(trace.maps))], fps, hold)
+    end = len(trace.maps)
+    return gif([board.picture(step) for step in range(max(0, end - steps), end)], fps, hold)
 
 
 def sharpest(maps: np.ndarray, count: int) -> np.ndarray:
