@@ -34,7 +34,7 @@ NAMES = {
     "phase2": "phase 2",
 }
 
-LEVELS = [("GoToObj", 1000), ("GoToLocal", 1000), ("PickupLoc", 1000), ("PutNextLocal", 1000)]
+LEVELS = [("GoToObj", 1000), ("GoToLocal", 1000), ("PickupLoc", 1000)]
 """Levels of BabyAI and numbers of demonstrations that the page speaks of, run or not."""
 
 Key = tuple[str, int, str, float]
