@@ -20,7 +20,7 @@ from ifo_grounding.report import (
 )
 from ifo_grounding.report.results import brief, restored
 from ifo_grounding.report.results import unpacked as outcomes
-from ifo_grounding.report.tables import renewed
+from ifo_grounding.report.tables import folded, renewed
 from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap
 from ifo_grounding.tasks import TASKS
 
@@ -204,9 +204,10 @@ def babyai_row(level: str, n: int, runs: list[dict[str, Any]]) -> dict[str, Any]
     for title, name in columns.items():
         known = runs and all(name in run["results"] for run in runs)
         row[title] = brief(two_level_bootstrap(outcomes(runs, name))) if known else "not run"
-    gained = row["phase 2"] != "not run"
-    both = [outcomes(runs, name) for name in ("phase1", "phase2")] if gained else []
-    row["gain, points"] = brief(paired_difference(*both)) if both else "not run"
+    row["gain, points"] = "not run"
+    if row["phase 2"] != "not run":
+        both = (outcomes(runs, name) for name in ("phase1", "phase2"))
+        row["gain, points"] = brief(paired_difference(*both))
     return row
 
 
@@ -269,7 +270,7 @@ def commands(found: dict[Key, list[dict[str, Any]]]) -> str:
         for runs in found.values()
         for run in runs
     ]
-    return "\n".join(['??? note "Commands"', "", *(f"    {line}" for line in made)])
+    return folded("Commands", made)
 
 
 def study_picture() -> Figure:

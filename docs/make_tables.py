@@ -14,7 +14,7 @@ from ifo_grounding.files import atomic_write, read_json
 from ifo_grounding.report import markdown_table
 from ifo_grounding.report.results import brief, restored
 from ifo_grounding.report.results import unpacked as outcomes
-from ifo_grounding.report.tables import renewed
+from ifo_grounding.report.tables import folded, renewed
 from ifo_grounding.stats import Rate, paired_difference, two_level_bootstrap, wilson
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.tasks.goals import REASONS
@@ -182,12 +182,7 @@ def commands(found: Pieces) -> str:
         for runs in found.values()
         for run in runs
     ]
-    return folded(made)
-
-
-def folded(made: list[str]) -> str:
-    """Return lines about commands, folded away."""
-    return "\n".join(['??? note "Commands"', "", *(f"    {line}" for line in made)]) if made else ""
+    return folded("Commands", made)
 
 
 def zero_shot_content() -> str:
@@ -281,7 +276,7 @@ def parts_content() -> str:
         for runs in found.values()
         for run in runs
     }
-    return "\n\n".join([table(rows), folded(sorted(made))])
+    return "\n\n".join([table(rows), folded("Commands", sorted(made))])
 
 
 def part_row(said: str, runs: list[dict[str, Any]]) -> dict[str, str]:

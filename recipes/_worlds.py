@@ -1,5 +1,6 @@
 """The worlds that recipes run in; the option `simulator` names one, `world` holds its settings."""
 
+import functools
 import os
 from collections.abc import Callable
 from typing import Any
@@ -22,6 +23,7 @@ from ifo_grounding.data import (
 from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv, from_gymnasium
 from ifo_grounding.errors import check_choice
+from ifo_grounding.tasks import Vocabulary
 from ifo_grounding.world import Layout
 
 ROOMS = 256
@@ -120,12 +122,16 @@ class BabyAI:
             self.level, episodes, seed=seed, stream=stream, processes=self.processes, **chosen
         )
 
-    def _rooms(self, num_envs: int, seed: int, stream: str, mission: str = "ends") -> GymnasiumEnv:
+    @functools.cached_property
+    def _words(self) -> Vocabulary:
         words = load_demonstrations(open_run(self.options)).vocabulary
         assert words is not None
+        return words
+
+    def _rooms(self, num_envs: int, seed: int, stream: str, mission: str = "ends") -> GymnasiumEnv:
         return from_gymnasium(
             babyai(self.level, self.tile_size, mission),
-            vocabulary=words,
+            vocabulary=self._words,
             num_envs=num_envs,
             instructed=mission != "none",
             stop=self.stop,

@@ -42,9 +42,7 @@ def imitate_transitions(
     file: str,
 ) -> dict:
     """Imitate transitions with their actions, from the best of a few initial weights."""
-    count = options.imitate.trials
-    beginnings = [Beginning(options, stage, seen, held_out, n) for n in range(count)]
-    best = min(beginnings, key=lambda beginning: beginning.try_out())
+    best = best_beginning(options, stage, seen, held_out)
     return train(
         options,
         stage,
@@ -73,7 +71,7 @@ class Beginning:
         seen: ReplayBuffer,
         held_out: ReplayBuffer | None,
         number: int,
-        imitation: Callable[[DictConfig, int], ImitationLoss] = imitation,
+        imitation: Callable[[DictConfig, int], ImitationLoss],
     ) -> None:
         self.options, self.stage, self.seen, self.number = options, stage, seen, number
         seed = derive(options.seed, "beginning", number) if number else options.seed
@@ -103,6 +101,21 @@ class Beginning:
             settings=self.stage.settings,
             until=until,
         )
+
+
+def best_beginning(
+    options: DictConfig,
+    stage: Stage,
+    seen: ReplayBuffer,
+    held_out: ReplayBuffer | None,
+    imitation: Callable[[DictConfig, int], ImitationLoss] = imitation,
+) -> Beginning:
+    """Try a few initial weights, and return those that imitate best so far."""
+    beginnings = [
+        Beginning(options, stage, seen, held_out, number, imitation)
+        for number in range(options.imitate.trials)
+    ]
+    return min(beginnings, key=lambda beginning: beginning.try_out())
 
 
 def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, ReplayBuffer | None]:

@@ -12,8 +12,7 @@ from omegaconf import DictConfig
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import Truth
 from ifo_grounding.report import results_table
-from ifo_grounding.report.results import packed
-from ifo_grounding.stats import wilson
+from ifo_grounding.report.results import by_scene
 
 
 def references(options: DictConfig) -> dict:
@@ -25,8 +24,7 @@ def references(options: DictConfig) -> dict:
     world, section = open_world(options), options.evaluate
     results = success_results(measured_success({"true_actions": policy}, world))
     solved = world.demonstrator(section.episodes, seed=section.seed, stream=section.stream)
-    rate = wilson(int(solved.sum()), len(solved))
-    results["demonstrator"] = {"rate": rate.as_dict(), "outcomes": packed(solved)}
+    results["demonstrator"] = by_scene(solved)
     return stage.finish(results)
 
 

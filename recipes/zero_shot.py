@@ -5,7 +5,6 @@ python recipes/zero_shot.py task=move seed=0
 
 import functools
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from _shared import open_run, open_stage
 from _worlds import open_world
 from collect_transitions import collect
 from evaluate import evaluation_scenes
-from imitate import Beginning, labelled_demonstrations
+from imitate import best_beginning, labelled_demonstrations
 from label import label
 from omegaconf import DictConfig
 from record_demonstrations import record
@@ -26,13 +25,14 @@ from train_inverse import train_inverse
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.errors import check_choice
 from ifo_grounding.evaluation import episode_endings, probe
+from ifo_grounding.evaluation.endings import SUCCESS
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
 from ifo_grounding.networks.grounding import EVIDENCE, Looks
 from ifo_grounding.networks.transfer import trunk_of
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.report import text_table
-from ifo_grounding.report.results import brief, packed, restored
-from ifo_grounding.stats import Rate, wilson
+from ifo_grounding.report.results import brief, by_scene, restored
+from ifo_grounding.stats import Rate
 
 
 class SeenWhole(ColourAndForm):
@@ -107,10 +107,7 @@ def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
     stage = open_stage(options, f"zero-shot-{name}", ["imitate", "evaluate"], ["label"])
     results = stage.result
     if results is None:
-        make = functools.partial(beginning, name)
-        count = options.imitate.trials
-        tried = [Beginning(options, stage, seen, None, number, make) for number in range(count)]
-        best = min(tried, key=lambda one: one.try_out())
+        best = best_beginning(options, stage, seen, None, functools.partial(beginning, name))
         best.learn()
         results = stage.finish(measured(best.loss.network, options))
     options.variant = name
@@ -141,8 +138,7 @@ def measured(policy: nn.Module, options: DictConfig) -> dict[str, Any]:
         scenes = {**evaluation_scenes(options), "split": split}
         place, shown = world.played(section.episodes, **scenes)
         ends = episode_endings(policy, place, **shown)
-        won = wilson(ends.counts["success"], len(ends.kind))
-        results[name] = {**ends.as_dict(), "rate": asdict(won), "outcomes": packed(ends.kind == 0)}
+        results[name] = {**ends.as_dict(), **by_scene(ends.kind == SUCCESS)}
     asked = {"seed": section.seed, "stream": section.stream, "holdout": options.world.holdout}
     results["probes"] = probe(policy, options.task, **asked).as_dict()
     return results

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import GroundedTrunk
+from ifo_grounding.networks.transfer import trunk_of
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import COLOURS, N_KINDS, SHAPES, WorldState, kind_name, render
 
@@ -48,10 +49,9 @@ def word_evidence(
     >>> said.words[0], said.objects[0], said.colour.shape
     ('red', 'red circle', torch.Size([12, 7]))
     """
-    trunks = [part for part in policy.modules() if isinstance(part, GroundedTrunk)]
-    if not trunks:
+    trunk = trunk_of(policy)
+    if not isinstance(trunk, GroundedTrunk):
         raise UserError("this policy does not read word by word: build it with preset 'grounded'")
-    (trunk,) = trunks
     state = WorldState.empty(1)
     state.objects[0, :N_KINDS] = torch.arange(1, N_KINDS + 1, dtype=torch.uint8)
     state.arm[0] = N_KINDS

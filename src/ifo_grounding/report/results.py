@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from ifo_grounding.report.tables import text_table
-from ifo_grounding.stats import Difference, Estimate, Rate
+from ifo_grounding.stats import Difference, Estimate, Rate, wilson
 
 REFERENCES = {"true_actions": "imitation of true actions", "demonstrator": "demonstrator"}
 """What no learner can or may be, by its name in the results."""
@@ -90,6 +90,18 @@ def brief(value: Measured) -> str:
 def packed(outcomes: Tensor) -> str:
     """Return the success of each scene, bool [N], as hexadecimal digits of four scenes each."""
     return np.packbits(outcomes.numpy()).tobytes().hex()
+
+
+def by_scene(outcomes: Tensor) -> dict[str, Any]:
+    """Return the rate of success and the success of each scene, bool [N], as plain values.
+
+    >>> import torch
+    >>> found = by_scene(torch.tensor([True, False, True]))
+    >>> found["rate"]["successes"], found["outcomes"]
+    (2, 'a0')
+    """
+    rate = wilson(int(outcomes.sum()), len(outcomes))
+    return {"rate": rate.as_dict(), "outcomes": packed(outcomes)}
 
 
 def unpacked(runs: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:

@@ -113,3 +113,14 @@ def renewed(text: str, mark: str, part: str) -> str:
     before, _, rest = text.partition(first)
     _, _, after = rest.partition(last)
     return f"{before}{first}{part}{last}{after}"
+
+
+def folded(title: str, lines: Sequence[str]) -> str:
+    r"""Return lines as a note of the docs that is folded away; nothing where there is none.
+
+    >>> folded("Commands", ["- one"])
+    '??? note "Commands"\n\n    - one'
+    """
+    if not lines:
+        return ""
+    return "\n".join([f'??? note "{title}"', "", *(f"    {line}" for line in lines)])
