@@ -140,10 +140,36 @@ def test_an_instruction_module_begins_with_what_the_policy_learned(shapes, prese
 
 
 @pytest.mark.parametrize("make", [make_instruction_classifier, make_goal_judge])
-def test_a_judge_of_sentences_cannot_begin_with_a_reader_of_words(shapes, make):
-    policy = make_policy(shapes, "grounded", seed=0)
+@pytest.mark.parametrize("presets", [("grounded", "strong"), ("strong", "grounded")])
+def test_a_judge_of_sentences_cannot_begin_with_a_reader_of_words(shapes, make, presets):
+    policy = make_policy(shapes, presets[0], seed=0)
     with pytest.raises(UserError, match="word by word"):
-        make(shapes, "grounded", init_from=policy)
+        make(shapes, presets[1], init_from=policy)
+
+
+@pytest.mark.parametrize("make", [make_instruction_classifier, make_goal_judge])
+def test_a_judge_of_words_begins_with_the_policys(shapes, make):
+    policy = make_policy(shapes, "grounded", seed=0)
+    judge = make(shapes, "grounded", init_from=policy, seed=1)
+    tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
+    trunk = trunk_of(policy)
+    first, other, now = torch.randint(256, (3, 5, *shapes.image_shape), dtype=torch.uint8)
+    seen = (first, now)[-judge.images :]
+    features = judge.encode_pixels(*seen)
+    silent = features.flatten(2)[:, -(trunk.attention.out_features + trunk.value.out_features) :]
+    looks = trunk.looks(now)
+    expected = torch.cat([trunk.attention(looks.silhouette), trunk.value(looks.silhouette)], -1)
+    torch.testing.assert_close(silent.transpose(1, 2), expected[looks.where])
+    if judge.images == 2:
+        last = features.shape[1] - shapes.vocabulary_size - silent.shape[1]
+        again = judge.encode_pixels(other, now)
+        assert torch.equal(features[:, last:], again[:, last:])
+        assert not torch.equal(features[:, :last], again[:, :last])
+    spoken, manner = trunk.words.listen(tokens)
+    words = judge.encode_instruction(tokens)
+    torch.testing.assert_close(words, torch.cat([spoken.flatten(1), manner], -1))
+    with pytest.raises(UserError, match="does not fit"):
+        make(shapes, "grounded", init_from=policy, heads=5)
 
 
 @pytest.mark.parametrize("preset", ["strong", "paper"])

@@ -25,13 +25,15 @@ from ifo_grounding.networks.grounding import (
     GroundedTrunk,
     WordMaps,
 )
-from ifo_grounding.networks.instruction import PairScorer, make_instruction_classifier
+from ifo_grounding.networks.instruction import make_instruction_classifier
 from ifo_grounding.networks.inverse import InverseNetwork, make_inverse
 from ifo_grounding.networks.persistence import load, save
 from ifo_grounding.networks.policy import PolicyNetwork, ValueNetwork, make_policy, make_value
 from ifo_grounding.networks.reward import RewardNetwork, make_reward_model
+from ifo_grounding.networks.scoring import PairScorer, SentenceScorer
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.sharing import from_pretrained, save_pretrained
+from ifo_grounding.networks.word_scoring import WordScorer
 
 __all__ = [
     "Blueprint",
@@ -52,10 +54,12 @@ __all__ = [
     "ResidualBlock",
     "ResidualFiLM",
     "RewardNetwork",
+    "SentenceScorer",
     "Shapes",
     "SpatialReadout",
     "ValueNetwork",
     "WordMaps",
+    "WordScorer",
     "attention_maps",
     "from_pretrained",
     "load",

@@ -21,7 +21,8 @@ class NetworkConfig:
 
     preset: str
     """``"paper"`` (strided convolutions, gated attention), ``"strong"`` (patches, FiLM), or
-    ``"grounded"``: as strong, but for policy and critic, which read word by word."""
+    ``"grounded"``: as strong, but policy, critic, instruction module and goal judge read word by
+    word."""
     features: int
     """Channels of the feature map."""
     conv_layers: int
@@ -136,6 +137,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "inverse": _INVERSE,
         "policy": _GROUNDED,
         "value": _GROUNDED,
+        "instruction": _GROUNDED,
+        "goal": _GROUNDED,
     },
 }
 """Values by preset and kind. A critic has no dropout: its targets would be noise."""

@@ -13,7 +13,7 @@ from torch import nn
 
 from ifo_grounding import keys
 from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
-from ifo_grounding.networks.instruction import PairScorer, begin_with_policy
+from ifo_grounding.networks.instruction import begin_with_policy, pair_scorer
 
 
 def make_goal_judge(
@@ -58,7 +58,7 @@ def make_goal_judge(
     check_keys(in_keys, ("first image", "image", "instruction"))
     options = {"in_keys": list(in_keys), "out_key": out_key}
     plan = blueprint("goal", spec_source, preset, options, overrides)
-    network = construct(partial(PairScorer, images=2), plan, device, seed)
+    network = construct(partial(pair_scorer, images=2), plan, device, seed)
     if init_from is not None:
         begin_with_policy(network, init_from, plan)
     return wrap(network, plan, in_keys, [out_key])

@@ -153,17 +153,25 @@ class WordMaps(nn.Module):
     def forward(self, looks: Looks, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps' logits [N, h * w, maps] and the manner [N, MANNER]."""
         colour, form = self.evidence(looks)
-        weights, manner = self.roles(tokens)
-        spoken = weights.new_zeros(len(tokens), len(self.role.weight), weights.shape[-1])
-        words = tokens.unsqueeze(-1).expand_as(weights)
-        spoken = spoken.scatter_add(1, words, weights)  # [N, V, maps]
+        spoken, manner = self.listen(tokens)
         if self.training and len(tokens) and not hidden_from_python(tokens):
             said = tokens.unique()
             said = said[said > 0]
             self.charge = _spread(colour[:, said]) + _spread(form[:, said])
-            self.usual.lerp_(spoken.detach().float().mean(0), self.pace)
-        spoken = spoken - self.usual.to(spoken.dtype)
         return look_up(colour + form, looks.where) @ spoken, manner
+
+    def listen(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how much each word counts for each map [N, V, maps], and the manner [N, MANNER].
+
+        What words usually count is taken off: it tells nothing of this instruction.
+        """
+        weights, manner = self.roles(tokens)
+        spoken = weights.new_zeros(len(tokens), len(self.role.weight), weights.shape[-1])
+        words = tokens.unsqueeze(-1).expand_as(weights)
+        spoken = spoken.scatter_add(1, words, weights)
+        if self.training and len(tokens) and not hidden_from_python(tokens):
+            self.usual.lerp_(spoken.detach().float().mean(0), self.pace)
+        return spoken - self.usual.to(spoken.dtype), manner
 
     def evidence(self, looks: Looks) -> tuple[Tensor, Tensor]:
         """Return what each word says of the colours and of the form of each cell, [U, V] each."""

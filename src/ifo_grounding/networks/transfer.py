@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.building import Blueprint
@@ -31,12 +32,17 @@ def instructed_network(policy: nn.Module) -> InstructedNetwork:
 
 
 def copy_weights(
-    parts: Sequence[tuple[nn.Module, nn.Module]], source: nn.Module, plan: Blueprint
+    parts: Sequence[tuple[nn.Module, nn.Module]],
+    source: nn.Module,
+    plan: Blueprint,
+    widened: Sequence[tuple[nn.Module, nn.Module]] = (),
 ) -> None:
     """Copy the weights of each pair's first module to its second.
 
     Args:
         parts: modules of the same kind and sizes.
+        widened: modules of which the second may read more images than one, whose inputs lie one
+            after the other: it reads the last one as the first module does, the others not yet.
         source: the network that the first modules are from, for the error.
         plan: what the network to begin was built from, for the error.
 
@@ -46,6 +52,10 @@ def copy_weights(
     try:
         for given, taken in parts:
             taken.load_state_dict(given.state_dict())
+        for given, taken in widened:
+            own, theirs = taken.state_dict(), given.state_dict()
+            fitted = {name: _last(weight, own[name]) for name, weight in theirs.items()}
+            taken.load_state_dict(fitted)
     except RuntimeError:
         origin: Blueprint | None = getattr(source, "network_config", None)
         described = f"{origin.config} for {origin.shapes}" if origin else "another network"
@@ -53,3 +63,11 @@ def copy_weights(
             f"the trunk of init_from does not fit: it is {described}, this is {plan.config} for "
             f"{plan.shapes}; give both the same preset, sizes and options"
         ) from None
+
+
+def _last(weight: Tensor, like: Tensor) -> Tensor:
+    """Return a weight as the last inputs of a larger one, whose first ones count nothing."""
+    more = like.shape[1] - weight.shape[1] if like.ndim > 1 else 0
+    if more <= 0:
+        return weight
+    return torch.cat([weight.new_zeros(len(weight), more, *weight.shape[2:]), weight], 1)

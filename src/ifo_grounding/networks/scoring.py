@@ -1,0 +1,235 @@
+"""Scoring how images and instructions go together, each encoded without the other."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up, pair_up
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.fusion import (
+    CellCount,
+    GatedAttention,
+    ResidualBlock,
+    ResidualFiLM,
+    SpatialReadout,
+)
+from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.trunk import (
+    Network,
+    cells_are_alone,
+    distinct_cells,
+    distinct_instructions,
+    encode_instruction,
+    flatten_cells,
+    fuse_pairs,
+    grid,
+    head,
+    image_encoder,
+    instruction_encoder,
+    same_batch,
+)
+
+CELLS_AT_ONCE, ROWS_AT_ONCE = 1 << 16, 1 << 12
+"""Cells and pairs that are computed together, to bound memory."""
+
+
+def slices(size: int, at_once: int) -> list[slice]:
+    """Cut a range into parts; an empty range is one part.
+
+    >>> slices(5, 3)
+    [slice(0, 3, None), slice(3, 6, None)]
+    """
+    return [slice(begin, begin + at_once) for begin in range(0, max(size, 1), at_once)]
+
+
+class PairScorer(Network):
+    """Base of the networks that score how images and an instruction go together, in two halves.
+
+    Images are encoded without the instruction and instructions without the images, so that N
+    scenes against P instructions cost N + P encodings and N x P light scores.
+    """
+
+    prior: Tensor
+    """Added to every logit: the log-odds of suitability before anything is seen, once known."""
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
+        super().__init__(shapes, config)
+        self.images = images
+        self.register_buffer("prior", torch.zeros(()))
+
+    def encode_pixels(self, *pixels: Tensor) -> Tensor:
+        """Map images, each [*B, C, H, W], to features [*B, F, h, w] that know no instruction."""
+        flat = [self.flat_pixels(image) for image in pixels]
+        same_batch(**{f"image {number}": batch for number, (_, batch) in enumerate(flat)})
+        with self.autocast(pixels[0]):
+            features = self._features([image for image, _ in flat])
+        return features.reshape(*flat[0][1], *features.shape[1:])
+
+    def _features(self, images: list[Tensor]) -> Tensor:
+        """Map images, each [N, C, H, W], to features [N, F, h, w]."""
+        raise NotImplementedError
+
+    def encode_instruction(self, instruction: Tensor) -> Tensor:
+        """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
+        raise NotImplementedError
+
+    def encode_scenes(self, *pixels: Tensor) -> Cells | Tensor:
+        """Encode images, each [N, C, H, W], for :meth:`score_candidates`.
+
+        Returns:
+            Features [N, F, h, w], or the distinct cells where these repeat and that pays.
+        """
+        return self.encode_pixels(*pixels)
+
+    def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:
+        """Score some instructions of a pool for each scene.
+
+        Args:
+            scenes: N encoded scenes, from :meth:`encode_scenes`.
+            words: encoded instructions [P, D], from :meth:`encode_instruction`.
+            index: candidates of each scene, int64 [N, K].
+
+        Returns:
+            Logits, float32 [N, K].
+        """
+        raise NotImplementedError
+
+    def score(self, features: Tensor, instruction: Tensor) -> Tensor:
+        """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""
+        raise NotImplementedError
+
+    def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:
+        """Score every scene [N, F, h, w] with every instruction [P, D]: logits [N, P].
+
+        ``chunk`` bounds the pairs scored at once, so that they stay in the processor's cache.
+        """
+        raise NotImplementedError
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Score images, each [*B, C, H, W], with token ids [*B, L], the last input."""
+        *pixels, instruction = inputs
+        return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))
+
+
+class SentenceScorer(PairScorer):
+    """Scores images with an instruction that is one vector.
+
+    ``strong`` scores by residual FiLM, attention maps that tell places, and counts of the cells
+    that fit; ``paper`` by gated attention.
+    """
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
+        super().__init__(shapes, config, images)
+        self.image = image_encoder(shapes, config, images)
+        features = config.features
+        self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
+        self.instruction = instruction_encoder(shapes, config)
+        self.strong = config.preset != "paper"
+        self.alone = cells_are_alone(config)
+        size = self.instruction.size
+        if self.strong:
+            self.fusion = nn.ModuleList(
+                ResidualFiLM(size, features, config.kernel) for _ in range(config.n_blocks)
+            )
+            self.readout = SpatialReadout(
+                features, config.heads, config.values, grid(shapes, config)
+            )
+            self.count = CellCount(features, config.detectors)
+            size = self.readout.size + self.count.size
+        else:
+            self.fusion = nn.ModuleList([GatedAttention(size, features)])
+            size = features * math.prod(grid(shapes, config))
+        self.head = head(size, config, 1)
+
+    def _features(self, images: list[Tensor]) -> Tensor:
+        features: Tensor = self.context(self.image(torch.cat(images, -3)))
+        return features
+
+    def encode_instruction(self, instruction: Tensor) -> Tensor:  # noqa: D102
+        return encode_instruction(self.instruction, instruction)
+
+    def encode_scenes(self, *pixels: Tensor) -> Cells | Tensor:  # noqa: D102
+        if self.alone:
+            flat = [self.flat_pixels(image)[0] for image in pixels]
+            with self.autocast(pixels[0]):
+                cells = distinct_cells(self.image, torch.cat(flat, -3))
+            if cells is not None:
+                return cells
+        return self.encode_pixels(*pixels)
+
+    def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:  # noqa: D102
+        rows, count = index.shape
+        which = index.flatten()
+        if not isinstance(scenes, Cells):
+            repeated = scenes.unsqueeze(1).expand(-1, count, *scenes.shape[1:]).flatten(0, 1)
+            return self.score(repeated, words[which]).reshape(rows, count)
+        places = scenes.index.repeat_interleave(count, 0)
+        pairs = pair_up(places, which, len(scenes.features), len(words))
+        with self.autocast(words):
+            parts = [
+                self._outlook(fuse_pairs(self.fusion, scenes.features, words, pairs[some]))
+                for some in slices(len(pairs), CELLS_AT_ONCE)
+            ]
+            outlook = torch.cat(parts)
+            outputs = [
+                self.head(self._read(look_up(outlook, pairs.index[some])))
+                for some in slices(len(which), ROWS_AT_ONCE)
+            ]
+        return torch.cat(outputs).float().reshape(rows, count) + self.prior
+
+    def _outlook(self, fused: Tensor) -> Tensor:
+        """Return all that is read of each cell, [Q, ...], of features [Q, F, 1, 1]."""
+        parts = [part.outlook(fused).flatten(1) for part in (self.readout, self.count)]
+        return torch.cat(parts, -1)
+
+    def _read(self, outlook: Tensor) -> Tensor:
+        """Read the cells of scenes, [N, h * w, ...]."""
+        sizes = [outlook.shape[-1] - self.config.detectors, self.config.detectors]
+        looked, counted = outlook.split(sizes, -1)
+        return torch.cat([self.readout.read(looked), self.count.read(counted)], -1)
+
+    def score(self, features: Tensor, instruction: Tensor) -> Tensor:
+        """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""
+        batch = features.shape[:-3]
+        same_batch(features=batch, instruction=instruction.shape[:-1])
+        with self.autocast(features):
+            cells = features.movedim(-3, -1)
+            fused = cells.reshape(-1, *cells.shape[-3:]).contiguous().movedim(-1, -3)
+            words = instruction.reshape(-1, instruction.shape[-1])
+            for fuse in self.fusion:
+                fused = fuse(fused, words)
+            outputs = self.head(self._summary(F.relu(fused)))
+        return outputs.float().reshape(*batch, 1) + self.prior
+
+    def _summary(self, fused: Tensor) -> Tensor:
+        if not self.strong:
+            return flatten_cells(fused)
+        return torch.cat([self.readout(fused), self.count(fused)], -1)
+
+    def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:  # noqa: D102
+        scenes, pool = len(features), len(instruction)
+        pairs = torch.arange(scenes * pool, device=features.device)
+        cells = features.movedim(-3, -1).contiguous()
+        parts = [
+            self.score(
+                cells.index_select(0, part // pool).movedim(-1, -3), instruction[part % pool]
+            )
+            for part in pairs.split(chunk)
+        ]
+        return torch.cat(parts).reshape(scenes, pool) if parts else features.new_zeros(scenes, pool)
+
+    def forward(self, *inputs: Tensor) -> Tensor:  # noqa: D102
+        *pixels, instruction = inputs
+        if self.alone and not hidden_from_python(instruction):
+            flat = [self.flat_pixels(image) for image in pixels]
+            batch = instruction.shape[:-1]
+            same_batch(**{f"image {n}": size for n, (_, size) in enumerate(flat)}, words=batch)
+            tokens = instruction.reshape(-1, instruction.shape[-1])
+            words, which = distinct_instructions(self.instruction, tokens)
+            scenes = self.encode_scenes(*(image for image, _ in flat))
+            return self.score_candidates(scenes, words, which.unsqueeze(1)).reshape(*batch, 1)
+        return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))

@@ -1,0 +1,135 @@
+"""Scoring how images and instructions go together, word by word."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up
+from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.networks.encoders import check_tokens, sentence_lengths
+from ifo_grounding.networks.fusion import cell_places
+from ifo_grounding.networks.grounding import MANNER, ColourAndForm, WordMaps
+from ifo_grounding.networks.scoring import PairScorer, slices
+from ifo_grounding.networks.shapes import Shapes, patch_size
+from ifo_grounding.networks.trunk import grid, head, same_batch
+
+PAIRS_AT_ONCE = 1 << 12
+"""Pairs of a scene and an instruction that are computed together, to bound memory."""
+
+
+class WordScorer(PairScorer):
+    """Scores images with an instruction of which each word adds its evidence about each cell.
+
+    A cell's features are what every word of the vocabulary says of it, for each image, and what
+    silent heads see in all images; an instruction's are how much every word counts for each map.
+    Their product are the maps, which tell places, as in
+    :class:`~ifo_grounding.networks.GroundedTrunk`, and how many cells fit.
+
+    Args:
+        shapes: sizes of inputs.
+        config: sizes of the network.
+        images: how many images are seen with one instruction, their cells side by side.
+    """
+
+    place: Tensor
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
+        super().__init__(shapes, config, images)
+        channels = shapes.image_shape[0]
+        self.looks = ColourAndForm(channels, config.features, patch_size(shapes, config))
+        self.words = WordMaps(shapes.vocabulary_size, config.maps, config.hidden // 2)
+        self.attention = nn.Linear(images * config.features, config.heads)
+        nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
+        self.value = nn.Linear(images * config.features, config.values)
+        self.register_buffer("place", cell_places(grid(shapes, config)), persistent=False)
+        self.known = shapes.vocabulary_size
+        maps = images * config.maps
+        self.scale = nn.Parameter(torch.ones(maps))
+        self.bias = nn.Parameter(torch.full((maps,), -4.0))  # most cells do not fit
+        seen = config.heads * (2 + config.values + 2 * maps)
+        self.head = head(seen + 2 * maps * 3 + 2 * maps + MANNER, config, 1)
+
+    def _features(self, images: list[Tensor]) -> Tensor:
+        """Map images, each [N, C, H, W], to features [N, images * V + heads + values, h, w]."""
+        said, silent = [], []
+        weight = torch.cat([self.attention.weight, self.value.weight])
+        for image, part in zip(images, weight.chunk(self.images, -1), strict=True):
+            looks = self.looks(image)
+            colour, form = self.words.evidence(looks)
+            said.append(look_up(colour + form, looks.where))
+            silent.append(look_up(F.linear(looks.silhouette, part), looks.where))
+        bias = torch.cat([self.attention.bias, self.value.bias])
+        cells = torch.cat([*said, torch.stack(silent).sum(0) + bias], -1)
+        return cells.unflatten(1, grid(self.shapes, self.config)).movedim(-1, 1)
+
+    def encode_instruction(self, instruction: Tensor) -> Tensor:
+        """Map token ids [*B, L] to how much each word counts, and the manner: [*B, D]."""
+        tokens = instruction.reshape(-1, instruction.shape[-1]).long()
+        which = None
+        if tokens.numel() and not hidden_from_python(tokens):
+            tokens, which = distinct_rows(tokens)
+            check_tokens(tokens, self.known)
+            tokens = tokens[:, : max(int(sentence_lengths(tokens).max()), 1)]
+        with torch.autocast(tokens.device.type, enabled=False):
+            spoken, manner = self.words.listen(tokens)
+            words = torch.cat([spoken.flatten(1), manner], -1)
+        words = words if which is None else look_up(words, which)
+        return words.reshape(*instruction.shape[:-1], words.shape[-1])
+
+    def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:  # noqa: D102
+        assert isinstance(scenes, Tensor)
+        rows = max(1, PAIRS_AT_ONCE // max(index.shape[1], 1))
+        with self.autocast(words):
+            parts = [
+                self.head(self._read(scenes[some].flatten(2), words, index[some])).squeeze(-1)
+                for some in slices(len(index), rows)
+            ]
+        return torch.cat(parts).float() + self.prior
+
+    def _read(self, cells: Tensor, words: Tensor, index: Tensor) -> Tensor:
+        """Read cells [N, F, h * w] in the light of some instructions [N, K]: [N, K, size]."""
+        count, maps = index.shape[1], self.config.maps
+        spoken, manner = words[:, :-MANNER], words[:, -MANNER:]
+        weights = spoken.unflatten(1, (self.known, maps)).transpose(1, 2)[index]  # [N, K, maps, V]
+        said = cells[:, : self.images * self.known].unflatten(1, (self.images, self.known))
+        told = weights.flatten(1, 2).unsqueeze(1) @ said  # [N, images, K * maps, h * w]
+        logits = told.unflatten(2, (count, maps)).transpose(1, 2).flatten(2, 3)
+        looked = torch.cat([logits, -logits], 2).softmax(-1)  # [N, K, 2 * images * maps, h * w]
+        silent = cells[:, self.images * self.known :]
+        heads = self.attention.out_features
+        attention = silent[:, :heads].softmax(-1)  # [N, heads, h * w]
+        place = self.place.to(cells.dtype)
+        seen = torch.cat([attention @ place, attention @ silent[:, heads:].transpose(1, 2)], -1)
+        beside = looked.flatten(1, 2) @ attention.transpose(1, 2)  # [N, K * maps, heads]
+        fits = torch.sigmoid(self.scale[:, None] * logits + self.bias[:, None]).sum(-1)
+        parts = [
+            seen.flatten(1).unsqueeze(1).expand(-1, count, -1),
+            beside.unflatten(1, looked.shape[1:3]).flatten(2),
+            (looked @ place).flatten(2),
+            looked.amax(-1),
+            fits,
+            torch.tanh(fits),
+            manner[index],
+        ]
+        return torch.cat(parts, -1)
+
+    def score(self, features: Tensor, instruction: Tensor) -> Tensor:  # noqa: D102
+        batch = features.shape[:-3]
+        same_batch(features=batch, instruction=instruction.shape[:-1])
+        words = instruction.reshape(-1, instruction.shape[-1])
+        own = torch.arange(len(words), device=words.device).unsqueeze(1)
+        scenes = features.reshape(-1, *features.shape[-3:])
+        return self.score_candidates(scenes, words, own).reshape(*batch, 1)
+
+    def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:  # noqa: D102
+        every = torch.arange(len(instruction), device=features.device)
+        parts = [
+            self.score_candidates(part, instruction, every.expand(len(part), -1))
+            for part in features.split(max(1, chunk // max(len(instruction), 1)))
+        ]
+        return torch.cat(parts)
