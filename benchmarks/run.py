@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 
+from ifo_grounding.allocation import keep_freed_memory
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.report import provenance, text_table
 
@@ -38,6 +39,7 @@ def measure_here(name: str, options: argparse.Namespace) -> dict:
     """Measure one row in this process."""
     torch.set_num_threads(options.threads)
     torch.set_flush_denormal(True)
+    keep_freed_memory()
     sys.path.insert(0, str(HERE))
     import rows
 

@@ -14,6 +14,7 @@ from torchrl import torchrl_logger
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding import networks
+from ifo_grounding.allocation import keep_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport
 from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
@@ -35,7 +36,8 @@ GOAL = "goal.safetensors"
 
 
 def open_run(options: DictConfig) -> Run:
-    """Return the run of these options, with torch's threads set."""
+    """Return the run of these options, with torch's threads and memory set."""
+    keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:
         torch.set_num_threads(options.threads)
