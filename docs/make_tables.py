@@ -25,6 +25,7 @@ PAGE = ROOT / "docs" / "tables.md"
 README = ROOT / "README.md"
 ZERO_SHOT = ROOT / "docs" / "zero-shot.md"
 PARTS = ROOT / "results" / "zero-shot"
+ABLATIONS = ROOT / "results" / "ablations"
 PRESETS = ("paper", "strong", "grounded")
 PAPER_EPISODES = 500
 """The paper's rates are multiples of 0.2%: they look like this many episodes each."""
@@ -170,6 +171,10 @@ def content() -> str:
         "Scenes that both solve, by another path or by the same:",
         table(path_rows),
         commands(found),
+        "## Ablations",
+        "What one choice does where demonstrations are few, preset `strong`. Gains of phase 2 over"
+        " phase 1 and differences from the whole, both greedy, are paired by scene, in points.",
+        ablation_content(),
     ]
     return "\n\n".join(part for part in parts if part)
 
@@ -183,6 +188,65 @@ def commands(found: Pieces) -> str:
         for run in runs
     ]
     return folded("Commands", made)
+
+
+VARIANTS_OF_PHASES = {
+    "whole": "the preset",
+    "true-actions": "true actions instead of labels: an upper bound",
+    "unchanged-kept": "transitions that change nothing are kept",
+    "steps-10000": "10,000 random steps instead of 60,000",
+    "steps-2000": "2,000 random steps",
+    "batch-64": "imitation in batches of 64 instead of 256",
+    "batch-1024": "imitation in batches of 1,024",
+    "tiles-16": "images of 96 x 96 pixels instead of 48 x 48",
+    "no-removal": "false negatives are not removed",
+    "any-instruction": "random instructions instead of chosen ones",
+    "action-reward": "the paper's reward of actions instead of the goal reward",
+    "both-rewards": "both rewards",
+}
+"""What each variant of `recipes/reproduce.py ablation=all` is."""
+
+
+def ablation_content() -> str:
+    """Return a table of what each choice does, for each task."""
+    found: Pieces = {}
+    for path in sorted(ABLATIONS.glob("*.json")):
+        run = read_json(path)
+        options = run["options"]
+        found.setdefault((options["task"], options["variant"]), []).append(run)
+    rows = []
+    for task in TASKS:
+        for name, said in VARIANTS_OF_PHASES.items():
+            if runs := found.get((task, "whole" if name == "true-actions" else name)):
+                whole = found.get((task, "whole"), [])
+                rows.append({"task": task, "": said, **ablation_row(runs, whole, name)})
+    return "\n\n".join(part for part in (table(rows), commands(found)) if part)
+
+
+def ablation_row(
+    runs: list[dict[str, Any]], whole: list[dict[str, Any]], name: str
+) -> dict[str, str]:
+    """Return what a variant reaches, and how far that is from the whole."""
+    bound = name == "true-actions"
+    first, last = ("true_actions", "phase1") if bound else ("phase1", "phase2")
+    row = {"seeds": str(len(runs)), "labels": "", "phase 1": "", "phase 2": "", "gain": ""}
+    row |= {"less the whole": "", "suitable": ""}
+    row["phase 1"] = brief(two_level_bootstrap(outcomes(runs, first)))
+    if bound:
+        gap = paired_difference(outcomes(runs, last), outcomes(runs, first))
+        return {**row, "less the whole": f"{brief(gap)} (phase 1)"}
+    row["labels"] = _mean([run["results"]["labels"]["rate"]["rate"] for run in runs])
+    row["phase 2"] = brief(two_level_bootstrap(outcomes(runs, last)))
+    row["gain"] = brief(paired_difference(outcomes(runs, first), outcomes(runs, last)))
+    if name != "whole" and len(whole) == len(runs):
+        gap = paired_difference(outcomes(whole, last), outcomes(runs, last))
+        row["less the whole"] = brief(gap)
+    row["suitable"] = _mean([run["results"]["suitability"]["rate"]["rate"] for run in runs])
+    return row
+
+
+def _mean(shares: list[float]) -> str:
+    return f"{100 * sum(shares) / len(shares):.2f}%"
 
 
 def zero_shot_content() -> str:

@@ -1,4 +1,4 @@
-"""The paper's tables and figures: every run they need, piece by piece, and what is missing yet.
+"""The paper's tables and figures, and ablations: every run they need, and what is missing yet.
 
 python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 """
@@ -66,7 +66,16 @@ class Piece:
 
 
 def pieces(options: DictConfig) -> list[list[Piece]]:
-    """Return the pieces of the tables and figures asked for: chains, each from one phase 1."""
+    """Return the pieces of what is asked for: chains, each from one phase 1."""
+    if all(options[kind] is None for kind in ("table", "figure", "ablation")):
+        raise UserError("name a table=2, 3 or 4, a figure=5 or 6, of the paper, or ablation=all")
+    tables = options.table is not None or options.figure is not None
+    found = table_chains(options) if tables else []
+    return found + (ablation_chains(options) if options.ablation is not None else [])
+
+
+def table_chains(options: DictConfig) -> list[list[Piece]]:
+    """Return the pieces of the table and the figure of the paper that are asked for."""
     phases = wanted_phases(options)
     for preset in options.presets:
         check_choice("preset", preset, options.options_of.preset)
@@ -76,11 +85,47 @@ def pieces(options: DictConfig) -> list[list[Piece]]:
     ]
 
 
+def ablation_chains(options: DictConfig) -> list[list[Piece]]:
+    """Return the pieces of the ablation asked for, and of the whole that it is compared with."""
+    sections = options.options_of.ablation
+    first, *others = sections.variant
+    asked = options.ablation
+    check_choice("ablation", asked, ["all", *others])
+    names = [first, *others] if asked == "all" else [first, asked]
+    known = [task for task in options.tasks if task in sections.task]
+    if not known:
+        raise UserError(f"ablations are of the tasks {', '.join(sections.task)} alone")
+    return [
+        [ablated(options, task, name, seed) for name in names]
+        for seed, task in product(options.seeds, known)
+    ]
+
+
+def ablated(options: DictConfig, task: str, name: str, seed: int) -> Piece:
+    """Return the piece of one variant."""
+    sections = options.options_of.ablation
+    variant = plain(sections.variant[name])
+    of = variant.pop("of", None)
+    runs = {part: f"ablations-{task}-{part}-seed{seed}" for part in (name, of)}
+    given = {
+        "task": task,
+        "seed": seed,
+        "run": runs[name],
+        "variant": name,
+        "results": options.ablations,
+        **({"base": runs[of]} if of else {}),
+        **flat(sections.all),
+        **flat(sections.task[task]),
+        **flat(variant),
+    }
+    parts = (task, given["demonstrations.n"], given["preset"], name, seed)
+    file = result_file(options.ablations, *parts)
+    return Piece(runs[name], tuple(f"{key}={value}" for key, value in given.items()), file)
+
+
 def wanted_phases(options: DictConfig) -> list[str]:
     """Return the phases that the tables and figures asked for need, in order."""
     asked = [(kind, options[kind]) for kind in ("table", "figure") if options[kind] is not None]
-    if not asked:
-        raise UserError("name a table=2, 3 or 4, or a figure=5 or 6, of the paper")
     for kind, number in asked:
         check_choice(kind, number, [of for which, of in WANTED if which == kind])
     needed = {phase for key in asked for phase in WANTED[key]}

@@ -54,6 +54,32 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, tmp_path):
     assert changed.file == second.file and not changed.done
 
 
+def test_an_ablation_changes_one_thing_of_the_whole(options, tmp_path):
+    from reproduce import pieces, reproduce
+
+    tiny = [
+        "options_of.ablation.all.budget=tiny",
+        "+options_of.ablation.all.evaluate.episodes=50",
+        "options_of.ablation.task.move.demonstrations.n=60",
+    ]
+    asked = options("ablation=any-instruction", f"ablations={tmp_path / 'found'}", *tiny)
+    ((whole, changed), (_, other)) = pieces(asked)
+    assert other.run == "ablations-pick-out-any-instruction-seed0"
+    assert whole.file.name == "move-60-strong-whole-seed0.json"
+    assert set(changed.arguments) - set(whole.arguments) == {
+        "run=ablations-move-any-instruction-seed0",
+        "variant=any-instruction",
+        "base=ablations-move-whole-seed0",
+        "instruction.threshold=0.0",
+    }
+    asked.tasks = ["move"]
+    assert reproduce(asked) == []
+    before, after = read_json(whole.file)["results"], read_json(changed.file)["results"]
+    assert before["phase1"] == after["phase1"]
+    assert "true_actions" in before and "true_actions" not in after
+    assert after["suitability"]["served"]["rate"] == 1.0
+
+
 def test_a_piece_that_fails_ends_its_chain(options):
     from reproduce import reproduce
 
@@ -74,7 +100,13 @@ def test_listing_runs_nothing(options, capsys):
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [([], "name a table"), (["table=7"], "table"), (["table=2", "presets=[huge]"], "huge")],
+    [
+        ([], "name a table"),
+        (["table=7"], "table"),
+        (["table=2", "presets=[huge]"], "huge"),
+        (["ablation=gravity"], "gravity"),
+        (["ablation=all", "tasks=[pick]"], "move, pick-out alone"),
+    ],
 )
 def test_what_cannot_be_reproduced_is_refused(options, given, said):
     from reproduce import pieces
