@@ -153,18 +153,21 @@ def test_a_judge_of_words_begins_with_the_policys(shapes, make):
     judge = make(shapes, "grounded", init_from=policy, seed=1)
     tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
     trunk = trunk_of(policy)
-    first, other, now = torch.randint(256, (3, 5, *shapes.image_shape), dtype=torch.uint8)
-    seen = (first, now)[-judge.images :]
+    start, other, now = torch.randint(256, (3, 5, *shapes.image_shape), dtype=torch.uint8)
+    seen = (start, now)[-judge.images :]
     features = judge.encode_pixels(*seen)
-    silent = features.flatten(2)[:, -(trunk.attention.out_features + trunk.value.out_features) :]
+    words_said = judge.images * shapes.vocabulary_size
+    heads = trunk.attention.out_features + trunk.value.out_features
+    silent = features.flatten(2)[:, words_said : words_said + heads]
     looks = trunk.looks(now)
     expected = torch.cat([trunk.attention(looks.silhouette), trunk.value(looks.silhouette)], -1)
     torch.testing.assert_close(silent.transpose(1, 2), expected[looks.where])
     if judge.images == 2:
-        last = features.shape[1] - shapes.vocabulary_size - silent.shape[1]
         again = judge.encode_pixels(other, now)
-        assert torch.equal(features[:, last:], again[:, last:])
-        assert not torch.equal(features[:, :last], again[:, :last])
+        last = slice(shapes.vocabulary_size, words_said + heads)
+        assert torch.equal(features[:, last], again[:, last])
+        first = slice(shapes.vocabulary_size)
+        assert not torch.equal(features[:, first], again[:, first])
     spoken, manner = trunk.words.listen(tokens)
     words = judge.encode_instruction(tokens)
     torch.testing.assert_close(words, torch.cat([spoken.flatten(1), manner], -1))

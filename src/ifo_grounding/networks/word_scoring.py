@@ -20,6 +20,8 @@ from ifo_grounding.networks.trunk import grid, head, same_batch
 
 PAIRS_AT_ONCE = 1 << 12
 """Pairs of a scene and an instruction that are computed together, to bound memory."""
+FORMS, AROUND = 8, 16
+"""Sizes of what is seen of a cell by its neighbours, and of what lies around each cell."""
 
 
 class WordScorer(PairScorer):
@@ -28,7 +30,8 @@ class WordScorer(PairScorer):
     A cell's features are what every word of the vocabulary says of it, for each image, and what
     silent heads see in all images; an instruction's are how much every word counts for each map.
     Their product are the maps, which tell places, as in
-    :class:`~ifo_grounding.networks.GroundedTrunk`, and how many cells fit.
+    :class:`~ifo_grounding.networks.GroundedTrunk`, what lies around these places, whether there is
+    one of them, and how many cells fit.
 
     Args:
         shapes: sizes of inputs.
@@ -46,26 +49,35 @@ class WordScorer(PairScorer):
         self.attention = nn.Linear(images * config.features, config.heads)
         nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
         self.value = nn.Linear(images * config.features, config.values)
+        self.form = nn.Linear(images * config.features, FORMS)
+        self.around = nn.Conv2d(FORMS, AROUND, 3, padding=1)
         self.register_buffer("place", cell_places(grid(shapes, config)), persistent=False)
         self.known = shapes.vocabulary_size
         maps = images * config.maps
         self.scale = nn.Parameter(torch.ones(maps))
         self.bias = nn.Parameter(torch.full((maps,), -4.0))  # most cells do not fit
         seen = config.heads * (2 + config.values + 2 * maps)
-        self.head = head(seen + 2 * maps * 3 + 2 * maps + MANNER, config, 1)
+        self.head = head(seen + 2 * maps * (3 + AROUND) + 2 * maps + MANNER, config, 1)
 
     def _features(self, images: list[Tensor]) -> Tensor:
-        """Map images, each [N, C, H, W], to features [N, images * V + heads + values, h, w]."""
+        """Map images [N, C, H, W] to features [N, images * V + heads + values + AROUND, h, w]."""
         said, silent = [], []
-        weight = torch.cat([self.attention.weight, self.value.weight])
+        heads = (self.attention, self.value, self.form)
+        weight = torch.cat([part.weight for part in heads])
         for image, part in zip(images, weight.chunk(self.images, -1), strict=True):
             looks = self.looks(image)
             colour, form = self.words.evidence(looks)
             said.append(look_up(colour + form, looks.where))
             silent.append(look_up(F.linear(looks.silhouette, part), looks.where))
-        bias = torch.cat([self.attention.bias, self.value.bias])
-        cells = torch.cat([*said, torch.stack(silent).sum(0) + bias], -1)
-        return cells.unflatten(1, grid(self.shapes, self.config)).movedim(-1, 1)
+        seen = torch.stack(silent).sum(0) + torch.cat([part.bias for part in heads])
+        size = grid(self.shapes, self.config)
+        seen, forms = (
+            part.unflatten(1, size).movedim(-1, 1)
+            for part in seen.split([seen.shape[-1] - FORMS, FORMS], -1)
+        )
+        around = F.relu(self.around(F.relu(forms)))
+        words = torch.cat(said, -1).unflatten(1, size).movedim(-1, 1)
+        return torch.cat([words, seen, around], 1)
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
         """Map token ids [*B, L] to how much each word counts, and the manner: [*B, D]."""
@@ -100,7 +112,9 @@ class WordScorer(PairScorer):
         told = weights.flatten(1, 2).unsqueeze(1) @ said  # [N, images, K * maps, h * w]
         logits = told.unflatten(2, (count, maps)).transpose(1, 2).flatten(2, 3)
         looked = torch.cat([logits, -logits], 2).softmax(-1)  # [N, K, 2 * images * maps, h * w]
-        silent = cells[:, self.images * self.known :]
+        silent, around = cells[:, self.images * self.known :].split(
+            [cells.shape[1] - self.images * self.known - AROUND, AROUND], 1
+        )
         heads = self.attention.out_features
         attention = silent[:, :heads].softmax(-1)  # [N, heads, h * w]
         place = self.place.to(cells.dtype)
@@ -111,6 +125,7 @@ class WordScorer(PairScorer):
             seen.flatten(1).unsqueeze(1).expand(-1, count, -1),
             beside.unflatten(1, looked.shape[1:3]).flatten(2),
             (looked @ place).flatten(2),
+            (looked @ around.transpose(1, 2).unsqueeze(1)).flatten(2),
             looked.amax(-1),
             fits,
             torch.tanh(fits),
