@@ -31,7 +31,7 @@ from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import grammar
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.transforms import InstructionSampler
-from ifo_grounding.world import Layout, random_layout, render, step, tile_index, tile_table
+from ifo_grounding.world import Layout, random_layout, render, step, tile_index, tile_table, walk
 
 DEVICE = "cpu"
 PRESETS = ("strong", "paper")
@@ -57,19 +57,26 @@ def world_step() -> Row:
     first = random_layout(batch, device=DEVICE)
     actions = torch.randint(6, (steps, batch), device=DEVICE)
 
-    def work() -> float:
+    def play(advance: Callable, at_once: int) -> float:
         state = first
-        for action in actions:
-            state = step(state, action)
+        for some in actions.split(at_once) if at_once > 1 else actions:
+            state = advance(state, some)
         return batch * steps
 
+    compiled = torch.compile(walk, dynamic=False)
+    assert (compiled(first, actions[:5]) == walk(first, actions[:5])).all()
     peer = Peer("navix")
     return Row(
         "world step, batch 4,096",
         "steps/s",
-        {**ours(work), **peer.contender("step")},
+        {
+            **ours(lambda: play(compiled, 5)),
+            "not compiled": timed(lambda: play(step, 1)),
+            **peer.contender("step"),
+        },
         {"rate": 25e6, "navix": 4},
-        "navix: an empty room of 6x6 cells, which holds no objects",
+        "ours by torch.compile, five steps at a time, as navix is by JAX, all at once; navix: an "
+        "empty room of 6x6 cells, which holds no objects",
         peers=[peer],
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 
 import torch
@@ -51,7 +50,7 @@ def step(state: WorldState, action: Tensor) -> WorldState:
     """
     arm, held, objects = state.arm, state.held, state.objects
     cells = objects.shape[-1]
-    places = _destinations(math.isqrt(cells), arm.device)
+    places = _destinations(cells, arm.device)
     arm = places.index_select(0, torch.add(arm, action, alpha=cells).flatten()).view(arm.shape)
     here = arm.unsqueeze(-1)
     under = objects.gather(-1, here).squeeze(-1)
@@ -67,9 +66,37 @@ def step(state: WorldState, action: Tensor) -> WorldState:
     )
 
 
-@functools.lru_cache(maxsize=64)
-def _destinations(size: int, device: torch.device) -> Tensor:
-    """Return the cell that each action leads to from each cell, int64 [6 * size * size]."""
-    cells = torch.arange(size * size, device=device)
-    led = [neighbour(cells, torch.full_like(cells, action), size)[0] for action in range(STOP + 1)]
-    return torch.cat(led)
+def walk(state: WorldState, actions: Tensor) -> WorldState:
+    """Apply several actions to each world, one after the other.
+
+    ``torch.compile(walk, dynamic=False)`` makes one loop of them, three times as fast as
+    :func:`step` for some five actions at a time.
+
+    Args:
+        state: worlds [*B].
+        actions: int64 [T, *B].
+
+    Returns:
+        The worlds after the last action, [*B].
+
+    >>> walk(WorldState.empty(1, size=6), torch.tensor([[DOWN], [RIGHT], [UP]])).arm
+    tensor([1])
+    """
+    for action in actions:
+        state = step(state, action)
+    return state
+
+
+_DESTINATIONS: dict[tuple[int, torch.device], Tensor] = {}
+
+
+def _destinations(cells: int, device: torch.device) -> Tensor:
+    """Return the cell that each action leads to from each cell, int64 [6 * cells]."""
+    if (cells, device) not in _DESTINATIONS:  # no lru_cache, which torch.compile would not heed
+        every = torch.arange(cells, device=device)
+        led = [
+            neighbour(every, torch.full_like(every, action), math.isqrt(cells))[0]
+            for action in range(STOP + 1)
+        ]
+        _DESTINATIONS[cells, device] = torch.cat(led)
+    return _DESTINATIONS[cells, device]
