@@ -151,31 +151,58 @@ class WordMaps(nn.Module):
         self.charge: Tensor | None = None
 
     def forward(self, looks: Looks, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the maps' logits [N, h * w, maps] and the manner [N, MANNER]."""
-        colour, form = self.evidence(looks)
-        spoken, manner = self.listen(tokens)
-        if self.training and len(tokens) and not hidden_from_python(tokens):
-            said = tokens.unique()
-            said = said[said > 0]
-            self.charge = _spread(colour[:, said]) + _spread(form[:, said])
-        return look_up(colour + form, looks.where) @ spoken, manner
+        """Return the maps' logits [N, maps, h * w] and the manner [N, MANNER]."""
+        used = self._in_use(tokens)
+        colour, form = self.evidence(looks, used)
+        spoken, manner = self.listen(tokens, used)
+        if self.training and used is not None:
+            said = torch.zeros(len(self.usual), dtype=torch.bool, device=tokens.device)
+            said[tokens] = True
+            said[0] = False
+            self.charge = _spread(colour[:, said[used]]) + _spread(form[:, said[used]])
+        evidence = look_up(colour + form, looks.where)
+        return spoken.transpose(1, 2) @ evidence.transpose(1, 2), manner
 
-    def listen(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
+    def evidence(self, looks: Looks, used: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return what words say of the colours and of the form of each cell, [U, V] each.
+
+        Args:
+            looks: distinct cells.
+            used: the words, int64 [V]; None means the whole vocabulary.
+        """
+        about = [self.about_colour.weight, self.about_form.weight]
+        colour, form = about if used is None else [look_up(words, used) for words in about]
+        return looks.colour @ colour.T, looks.form @ form.T
+
+    def listen(self, tokens: Tensor, used: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return how much each word counts for each map [N, V, maps], and the manner [N, MANNER].
 
         What words usually count is taken off: it tells nothing of this instruction.
+
+        Args:
+            tokens: token ids [N, L].
+            used: words of which all others count nothing, int64 [V]; None means all words.
         """
         weights, manner = self.roles(tokens)
-        spoken = weights.new_zeros(len(tokens), len(self.role.weight), weights.shape[-1])
-        words = tokens.unsqueeze(-1).expand_as(weights)
-        spoken = spoken.scatter_add(1, words, weights)
+        usual = self.usual if used is None else self.usual[used]
+        if used is not None:
+            number = tokens.new_zeros(len(self.usual))
+            number[used] = torch.arange(len(used), device=used.device)
+            tokens = number[tokens]
+        spoken = weights.new_zeros(len(tokens), len(usual), weights.shape[-1])
+        spoken = spoken.scatter_add(1, tokens.unsqueeze(-1).expand_as(weights), weights)
         if self.training and len(tokens) and not hidden_from_python(tokens):
-            self.usual.lerp_(spoken.detach().float().mean(0), self.pace)
-        return spoken - self.usual.to(spoken.dtype), manner
+            usual = usual.lerp(spoken.detach().float().mean(0), self.pace)
+            self.usual[slice(None) if used is None else used] = usual
+        return spoken - usual.to(spoken.dtype), manner
 
-    def evidence(self, looks: Looks) -> tuple[Tensor, Tensor]:
-        """Return what each word says of the colours and of the form of each cell, [U, V] each."""
-        return looks.colour @ self.about_colour.weight.T, looks.form @ self.about_form.weight.T
+    def _in_use(self, tokens: Tensor) -> Tensor | None:
+        """Return the words that count anything, said now or before; None where that is unknown."""
+        if not tokens.numel() or hidden_from_python(tokens):
+            return None
+        counts = (self.usual != 0).any(1)
+        counts[tokens] = True
+        return counts.nonzero().squeeze(1)
 
     def roles(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much words count for each map [N, L, maps], and the manner [N, MANNER]."""
@@ -254,15 +281,18 @@ class GroundedTrunk(nn.Module):
         silent = torch.cat([self.attention(looks.silhouette), self.value(looks.silhouette)], -1)
         silent = look_up(silent, looks.where)
         heads = self.attention.out_features
-        attention = silent[..., :heads].softmax(1).transpose(1, 2)  # [N, heads, h * w]
-        place = self.place.to(maps.dtype).expand(len(maps), -1, -1)
-        seen = attention @ torch.cat([place, silent[..., heads:], maps], -1)
-        pointed = maps.transpose(1, 2) @ place
-        return torch.cat([seen.flatten(1), pointed.flatten(1), manner], -1)
+        attention = silent[..., :heads].transpose(1, 2).softmax(-1)
+        place = self.place.to(maps.dtype)
+        seen = [
+            attention @ place,
+            attention @ silent[..., heads:],
+            attention @ maps.transpose(1, 2),
+        ]
+        return torch.cat([torch.cat(seen, -1).flatten(1), (maps @ place).flatten(1), manner], -1)
 
     def weigh(self, logits: Tensor) -> Tensor:
-        """Weigh cells by evidence for them and by evidence against them: [N, h * w, 2 * maps]."""
-        return torch.cat([logits, -logits if self.both_ways else logits], -1).softmax(1)
+        """Weigh cells [N, maps, h * w] by evidence for and against them: [N, 2 * maps, h * w]."""
+        return torch.cat([logits, -logits if self.both_ways else logits], 1).softmax(-1)
 
     def cells(self, image: Tensor) -> Tensor:
         """Return what words and silent heads see of each cell of [N, C, H, W]: [N, h * w, F]."""
@@ -272,7 +302,7 @@ class GroundedTrunk(nn.Module):
     def maps(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Return how each map weighs the cells of an image: [N, 2 * maps, h * w]."""
         logits, _ = self.words(self.looks(image), tokens.long())
-        return self.weigh(logits).transpose(1, 2)
+        return self.weigh(logits)
 
 
 def _spread(evidence: Tensor) -> Tensor:
