@@ -261,7 +261,28 @@ def zero_shot_content() -> str:
     return table(rows)
 
 
-def readme_content() -> str:
+def readme_tables() -> str:
+    """Return the short form of Tables 2 and 3, the paper beside our best preset."""
+    found = pieces()
+    rows = []
+    for task in TASKS:
+        before, *after = TABLE_2[task]
+        first, practised = (found.get((task, "strong", name)) for name in ("phase-1", "pairs-5000"))
+        chosen = [run["results"]["suitability"]["rate"]["rate"] for run in first or []]
+        rows.append(
+            {
+                "task": task,
+                "the paper, phase 1 / best phase 2": f"{before:.1f}% / {max(after):.1f}%",
+                "phase 1": success(first, "phase1"),
+                "phase 2": success(practised, "phase2").split("<br>")[0],
+                "suitable: the paper": f"{TABLE_3[task]:.1f}%",
+                "suitable: here": f"{100 * sum(chosen) / len(chosen):.1f}%" if chosen else NOT_RUN,
+            }
+        )
+    return table(rows)
+
+
+def readme_zero_shot() -> str:
     """Return the short table of zero-shot, beside the paper's."""
     found = pieces()
     rows = []
@@ -369,7 +390,8 @@ def written() -> dict[Path, str]:
     zero_shot = ZERO_SHOT.read_text()
     for mark, part in (("zero-shot", zero_shot_content()), ("parts", parts_content())):
         zero_shot = renewed(zero_shot, mark, f"\n\n{part}\n\n")
-    readme = renewed(README.read_text(), "zero-shot", f"\n{readme_content()}\n")
+    readme = renewed(README.read_text(), "zero-shot", f"\n{readme_zero_shot()}\n")
+    readme = renewed(readme, "paper", f"\n{readme_tables()}\n")
     return {PAGE: tables, ZERO_SHOT: zero_shot, README: readme}
 
 
