@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 
 
 class UserError(ValueError):
@@ -20,3 +21,18 @@ def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     if value not in options:
         listed = ", ".join(repr(option) for option in options)
         raise UserError(f"unknown {name} {value!r}: choose one of {listed}")
+
+
+@contextlib.contextmanager
+def extra(name: str, why: str) -> Iterator[None]:
+    """Say how to install what an optional part needs, where importing it fails.
+
+    >>> with extra("video", "videos need a library"):
+    ...     import no_such_library
+    Traceback (most recent call last):
+    ifo_grounding.errors.UserError: videos need a library: pip install 'ifo-grounding[video]'
+    """
+    try:
+        yield
+    except ImportError:
+        raise UserError(f"{why}: pip install 'ifo-grounding[{name}]'") from None

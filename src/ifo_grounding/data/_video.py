@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 from PIL import Image
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, extra
 
 CODEC = "libx264"
 
@@ -52,11 +52,7 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
 
 
 def _libraries() -> tuple[ModuleType, ModuleType]:
-    try:
+    with extra("video", "videos need imageio and PyAV"):
         import av
         import imageio.v3 as iio
-    except ImportError:
-        raise UserError(
-            "videos need imageio and PyAV: pip install 'ifo-grounding[video]'"
-        ) from None
     return iio, av

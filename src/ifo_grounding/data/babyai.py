@@ -20,7 +20,7 @@ from tqdm import tqdm
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.wrapping import world_seed
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, extra
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -54,10 +54,8 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
     """
     check_choice("mission", mission, MISSIONS)
     name = level if level.endswith(("-v0", "-v1")) else f"BabyAI-{level}-v0"
-    try:
+    with extra("babyai", "BabyAI needs minigrid"):
         import minigrid  # noqa: F401  (registers the levels)
-    except ImportError:
-        raise UserError("BabyAI needs minigrid: pip install 'ifo-grounding[babyai]'") from None
     if name not in gymnasium.registry:
         known = sorted(i[7:-3] for i in gymnasium.registry if i.startswith("BabyAI-"))
         raise UserError(f"there is no level {name!r}: choose among {', '.join(known)}")

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from ifo_grounding.data._reading import Episode, stack_pictures
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import check_colours, rgb
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, extra
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
@@ -138,10 +138,8 @@ def to_huggingface(
     Raises:
         UserError: where ``datasets`` is missing, there is no vocabulary, or frames are no pictures.
     """
-    try:
+    with extra("datasets", "this needs datasets"):
         import datasets
-    except ImportError:
-        raise UserError("this needs datasets: pip install 'ifo-grounding[datasets]'") from None
     sentences = demos.sentences()
     check_colours(demos)
 

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from ifo_grounding.data._reading import LAST, Episode
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import check_colours, rgb
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, extra
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
@@ -236,8 +236,6 @@ def _buffers(demos: Demonstrations, sentences: list[str]) -> Iterator[EpisodeBuf
 
 
 def _minari() -> Any:
-    try:
+    with extra("minari", "this needs Minari"):
         import minari
-    except ImportError:
-        raise UserError("this needs Minari: pip install 'ifo-grounding[minari]'") from None
     return minari

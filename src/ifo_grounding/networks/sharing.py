@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, extra
 from ifo_grounding.files import atomic_write, read_json, write_json
 from ifo_grounding.networks.building import Blueprint
 from ifo_grounding.networks.persistence import load, save
@@ -140,10 +140,6 @@ network = from_pretrained("path/to/this/folder")
 
 
 def _hub() -> Any:
-    try:
+    with extra("hub", "the Hugging Face Hub needs an extra"):
         import huggingface_hub
-    except ImportError:
-        raise UserError(
-            "the Hugging Face Hub needs an extra: pip install 'ifo-grounding[hub]'"
-        ) from None
     return huggingface_hub
