@@ -313,13 +313,9 @@ def page(found: list[dict[str, Any]]) -> str:
 
 def readme(text: str) -> str:
     """Return the README with its table of results renewed."""
-    shown = ("task", "demonstrations", "held out", "seeds", "phase 1", "phase 2")
+    shown = ("task", "demonstrations", "preset", "held out", "seeds", "phase 1", "phase 2")
     against = ("over continued", "over cloned")
-    rows = [
-        {name: row[name] for name in (*shown, *against)}
-        for row in study_rows()
-        if row["preset"] == "strong"
-    ]
+    rows = [{name: row[name] for name in (*shown, *against)} for row in study_rows()]
     return renewed(text, "results", f"\n{markdown_table(rows)}\n")
 
 
