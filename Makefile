@@ -16,7 +16,7 @@ demo: $(RUN) ## main job: both phases on one task and a report (TASK=pick, ARGS=
 	$(BIN)/ifo-grounding demo $(if $(TASK),task=$(TASK)) $(ARGS)
 
 test: $(DEV) ## all fast tests, doctests and examples of the docs; line coverage >= 90%
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --cov $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist worksteal --cov $(ARGS)
 
 test-slow: $(DEV) ## tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) -m slow --timeout 3600 $(ARGS)
