@@ -278,7 +278,8 @@ def readme_tables() -> str:
         for preset in ("strong", "grounded"):
             runs = found.get((task, preset, "phase-1"), [])
             chosen = [100 * run["results"]["suitability"]["rate"]["rate"] for run in runs]
-            row[f"suitable: `{preset}`"] = f"{sum(chosen) / len(chosen):.1f}%" if chosen else NOT_RUN
+            mean = f"{sum(chosen) / len(chosen):.1f}%" if chosen else NOT_RUN
+            row[f"suitable: `{preset}`"] = mean
         rows.append(row)
     return table(rows)
 
