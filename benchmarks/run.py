@@ -1,7 +1,7 @@
 """Speed of every part, beside what else does the same: ``python benchmarks/run.py [row ...]``.
 
 Each row runs in a process of its own on the same cores; contenders of a row take turns. Writes a
-results file; ``python docs/make_results.py`` makes the page of it.
+results file; ``python docs/make_speed.py`` makes the page of it.
 """
 
 from __future__ import annotations

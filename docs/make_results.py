@@ -5,6 +5,7 @@ of ``README.md`` between its two marks. A test checks that both are up to date.
 """
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from ifo_grounding.report import (
     results_rows,
     save_figure,
 )
-from ifo_grounding.report.results import brief, restored
+from ifo_grounding.report.results import brief, commands_note, read_results, restored
 from ifo_grounding.report.results import unpacked as outcomes
-from ifo_grounding.report.tables import folded, renewed
+from ifo_grounding.report.tables import renewed
 from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap
 from ifo_grounding.tasks import TASKS
 
@@ -49,16 +50,16 @@ def runs() -> list[dict[str, Any]]:
 
 def studies() -> dict[Key, list[dict[str, Any]]]:
     """Return the committed seeds of each study."""
-    found: dict[Key, list[dict[str, Any]]] = {}
-    for path in sorted((ROOT / "results" / "study").glob("*.json")):
-        run = read_json(path)
-        options = run["options"]
-        variant = options.get("variant")
-        kind = f"{options['network']}, {variant}" if variant else options["network"]
-        held_out = options["imitate"].get("held_out", 0.0)
-        key = (options["task"], options["demonstrations"]["n"], kind, held_out)
-        found.setdefault(key, []).append(run)
+    found = read_results(ROOT / "results" / "study", study_of)
     return dict(sorted(found.items(), key=lambda item: (TASKS.index(item[0][0]), item[0][1:])))
+
+
+def study_of(options: Mapping[str, Any]) -> Key:
+    """Return to which study a run belongs."""
+    variant = options.get("variant")
+    kind = f"{options['network']}, {variant}" if variant else options["network"]
+    held_out = options["imitate"].get("held_out", 0.0)
+    return options["task"], options["demonstrations"]["n"], kind, held_out
 
 
 def study_section() -> list[str]:
@@ -79,7 +80,7 @@ def study_section() -> list[str]:
         " tasks with as many demonstrations.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table(rows),
-        commands(practised()),
+        commands_note(practised().values()),
     ]
 
 
@@ -102,7 +103,7 @@ def variant_section() -> list[str]:
         "What else was tried, from the same phase 1; the pages of the phases say why it does what"
         " it does.",
         markdown_table(rows),
-        commands(found),
+        commands_note(found.values()),
     ]
 
 
@@ -135,7 +136,7 @@ def module_section() -> list[str]:
         "Suitable instructions among those chosen, and states served, by ways to train the"
         " [instruction module](phase2.md#the-instruction-module) from the same phase 1.",
         markdown_table(rows),
-        commands(found),
+        commands_note(found.values()),
     ]
 
 
@@ -169,18 +170,14 @@ def imitation_section() -> list[str]:
         "When to [stop imitating](phase1.md#when-to-stop): success on 4,000 validation scenes, from"
         " the same labels.",
         markdown_table(rows),
-        commands(found),
+        commands_note(found.values()),
     ]
 
 
 def babyai_section() -> list[str]:
     """Return what was measured in the levels of BabyAI."""
-    found: dict[tuple[str, int], list[dict[str, Any]]] = {level: [] for level in LEVELS}
-    for path in sorted((ROOT / "results" / "babyai").glob("*.json")):
-        run = read_json(path)
-        level = (run["options"]["task"], run["options"]["demonstrations"]["n"])
-        found.setdefault(level, []).append(run)
-    ran = {(*level, "", 0.0): runs for level, runs in found.items() if runs}
+    ran = read_results(ROOT / "results" / "babyai", lambda o: (o["task"], o["demonstrations"]["n"]))
+    found = {**{level: [] for level in LEVELS}, **ran}
     return [
         "## BabyAI",
         "Greedy success by BabyAI's own reward in fixed rooms, in percent, with 95% intervals over"
@@ -188,7 +185,7 @@ def babyai_section() -> list[str]:
         " in place of labels, which no learner may read: an upper reference for phase 1, as the bot"
         " itself is.",
         markdown_table([babyai_row(*level, runs) for level, runs in found.items()]),
-        *([commands(ran)] if ran else []),
+        *([commands_note(ran.values())] if ran else []),
     ]
 
 
@@ -261,16 +258,6 @@ def adjusted(found: dict[Key, list[dict[str, Any]]]) -> list[str]:
         ]
         corrected |= dict(zip(members, holm([test.p_value for test in tests]), strict=True))
     return [f"{corrected[key]:.2g}" for key in found]
-
-
-def commands(found: dict[Key, list[dict[str, Any]]]) -> str:
-    """Return by what each result was made, folded away."""
-    made = [
-        f"- `{run['command']}` (commit `{run['provenance']['commit']}`)"
-        for runs in found.values()
-        for run in runs
-    ]
-    return folded("Commands", made)
 
 
 def study_picture() -> Figure:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from ifo_grounding.evaluation.endings import ENDINGS, SHARED
-from ifo_grounding.files import atomic_write, read_json
+from ifo_grounding.files import atomic_write
 from ifo_grounding.report import markdown_table
-from ifo_grounding.report.results import brief, restored
+from ifo_grounding.report.results import brief, commands_note, read_results, restored
 from ifo_grounding.report.results import unpacked as outcomes
-from ifo_grounding.report.tables import folded, renewed
+from ifo_grounding.report.tables import renewed
 from ifo_grounding.stats import Rate, paired_difference, two_level_bootstrap, wilson
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.tasks.goals import REASONS
@@ -48,12 +48,9 @@ Pieces = dict[Any, list[dict[str, Any]]]
 
 def pieces() -> Pieces:
     """Return the committed seeds of each task, preset and phase."""
-    found: Pieces = {}
-    for path in sorted((ROOT / "results" / "tables").glob("*.json")):
-        run = read_json(path)
-        options = run["options"]
-        found.setdefault((options["task"], options["network"], options["variant"]), []).append(run)
-    return found
+    return read_results(
+        ROOT / "results" / "tables", lambda o: (o["task"], o["network"], o["variant"])
+    )
 
 
 def success(runs: list[dict[str, Any]] | None, name: str) -> str:
@@ -65,6 +62,11 @@ def success(runs: list[dict[str, Any]] | None, name: str) -> str:
         return rate
     gain = paired_difference(outcomes(runs, "phase1"), outcomes(runs, name))
     return f"{rate}<br>{brief(gain)} points"
+
+
+def mean(shares: list[float], digits: int = 2) -> str:
+    """Return the mean of shares in percent."""
+    return f"{100 * sum(shares) / len(shares):.{digits}f}%"
 
 
 def of_paper(percent: float) -> str:
@@ -170,24 +172,13 @@ def content() -> str:
         table(change_rows(found)),
         "Scenes that both solve, by another path or by the same:",
         table(path_rows),
-        commands(found),
+        commands_note(found.values()),
         "## Ablations",
         "What one choice does where demonstrations are few, preset `strong`. Gains of phase 2 over"
         " phase 1 and differences from the whole, both greedy, are paired by scene, in points.",
         ablation_content(),
     ]
     return "\n\n".join(part for part in parts if part)
-
-
-def commands(found: Pieces) -> str:
-    """Return by what each result was made, folded away."""
-    made = [
-        f"- `{run['command']}` (commit `{run['provenance']['commit']}`, "
-        f"{run['seconds'] / 60:.0f} minutes, {run['provenance']['machine']})"
-        for runs in found.values()
-        for run in runs
-    ]
-    return folded("Commands", made)
 
 
 VARIANTS_OF_PHASES = {
@@ -209,18 +200,14 @@ VARIANTS_OF_PHASES = {
 
 def ablation_content() -> str:
     """Return a table of what each choice does, for each task."""
-    found: Pieces = {}
-    for path in sorted(ABLATIONS.glob("*.json")):
-        run = read_json(path)
-        options = run["options"]
-        found.setdefault((options["task"], options["variant"]), []).append(run)
+    found: Pieces = read_results(ABLATIONS, lambda o: (o["task"], o["variant"]))
     rows = []
     for task in TASKS:
         for name, said in VARIANTS_OF_PHASES.items():
             if runs := found.get((task, "whole" if name == "true-actions" else name)):
                 whole = found.get((task, "whole"), [])
                 rows.append({"task": task, "": said, **ablation_row(runs, whole, name)})
-    return "\n\n".join(part for part in (table(rows), commands(found)) if part)
+    return "\n\n".join(part for part in (table(rows), commands_note(found.values())) if part)
 
 
 def ablation_row(
@@ -235,18 +222,14 @@ def ablation_row(
     if bound:
         gap = paired_difference(outcomes(runs, last), outcomes(runs, first))
         return {**row, "less the whole": f"{brief(gap)} (phase 1)"}
-    row["labels"] = _mean([run["results"]["labels"]["rate"]["rate"] for run in runs])
+    row["labels"] = mean([run["results"]["labels"]["rate"]["rate"] for run in runs])
     row["phase 2"] = brief(two_level_bootstrap(outcomes(runs, last)))
     row["gain"] = brief(paired_difference(outcomes(runs, first), outcomes(runs, last)))
     if name != "whole" and len(whole) == len(runs):
         gap = paired_difference(outcomes(whole, last), outcomes(runs, last))
         row["less the whole"] = brief(gap)
-    row["suitable"] = _mean([run["results"]["suitability"]["rate"]["rate"] for run in runs])
+    row["suitable"] = mean([run["results"]["suitability"]["rate"]["rate"] for run in runs])
     return row
-
-
-def _mean(shares: list[float]) -> str:
-    return f"{100 * sum(shares) / len(shares):.2f}%"
 
 
 def zero_shot_content() -> str:
@@ -277,9 +260,8 @@ def readme_tables() -> str:
         }
         for preset in ("strong", "grounded"):
             runs = found.get((task, preset, "phase-1"), [])
-            chosen = [100 * run["results"]["suitability"]["rate"]["rate"] for run in runs]
-            mean = f"{sum(chosen) / len(chosen):.1f}%" if chosen else NOT_RUN
-            row[f"suitable: `{preset}`"] = mean
+            chosen = [run["results"]["suitability"]["rate"]["rate"] for run in runs]
+            row[f"suitable: `{preset}`"] = mean(chosen, 1) if chosen else NOT_RUN
         rows.append(row)
     return table(rows)
 
@@ -353,17 +335,9 @@ PROBES = {
 
 def parts_content() -> str:
     """Return the table of what each part of the preset does, one part left out at a time."""
-    found: Pieces = {}
-    for path in sorted(PARTS.glob("*.json")):
-        run = read_json(path)
-        found.setdefault(run["options"]["variant"], []).append(run)
+    found: Pieces = read_results(PARTS, lambda o: o["variant"])
     rows = [part_row(said, found[name]) for name, said in VARIANTS.items() if name in found]
-    made = {
-        f"- `{run['command']}` (commit `{run['provenance']['commit']}`)"
-        for runs in found.values()
-        for run in runs
-    }
-    return "\n\n".join([table(rows), folded("Commands", sorted(made))])
+    return "\n\n".join([table(rows), commands_note(found.values())])
 
 
 def part_row(said: str, runs: list[dict[str, Any]]) -> dict[str, str]:

@@ -4,6 +4,7 @@ import pytest
 import torch
 from PIL import Image
 
+from comparing import all_frames, assert_same
 from ifo_grounding.data import (
     Demonstrations,
     from_huggingface,
@@ -16,23 +17,6 @@ from ifo_grounding.tasks import VOCABULARY
 datasets.disable_progress_bars()
 
 
-@pytest.fixture
-def demos():
-    return record_demonstrations("move", 12, seed=0)
-
-
-def all_frames(demos):
-    return demos.frames(torch.arange(demos.n_frames))
-
-
-def same(one, other):
-    return (
-        one.sentences() == other.sentences()
-        and torch.equal(one.lengths, other.lengths)
-        and torch.equal(all_frames(one), all_frames(other))
-    )
-
-
 def test_a_dataset_comes_back_as_it_was(demos, tmp_path):
     dataset = to_huggingface(demos, cache_dir=tmp_path / "cache")
     assert dataset.num_rows == 12
@@ -40,10 +24,10 @@ def test_a_dataset_comes_back_as_it_was(demos, tmp_path):
     assert dataset[3]["instruction"] == demos.sentences()[3]
     assert dataset[3]["frames"][0].size == (48, 48)
     back = from_huggingface(dataset, vocabulary=VOCABULARY)
-    assert same(back, demos)
+    assert_same(back, demos)
     assert torch.equal(back.tokens, demos.tokens)
     other = record_demonstrations("move", 3, seed=1)
-    assert same(from_huggingface(to_huggingface(other, cache_dir=tmp_path / "cache")), other)
+    assert_same(from_huggingface(to_huggingface(other, cache_dir=tmp_path / "cache")), other)
 
 
 def test_files_and_streams_are_read(demos, tmp_path):
@@ -61,7 +45,7 @@ def test_files_and_streams_are_read(demos, tmp_path):
         dataset.cast_column("frames", datasets.Sequence(datasets.Image(decode=False))),
         (dict(row) for row in dataset),
     ):
-        assert same(from_huggingface(read), demos)
+        assert_same(from_huggingface(read), demos)
 
 
 def test_only_the_two_columns_are_read(demos, tmp_path):
@@ -71,7 +55,7 @@ def test_only_the_two_columns_are_read(demos, tmp_path):
     dataset = dataset.add_column("action", broken).cast_column("action", datasets.Image())
     with pytest.raises(OSError, match="identify"):
         dataset[0]
-    assert same(from_huggingface(dataset, frames="video", instruction="task"), demos)
+    assert_same(from_huggingface(dataset, frames="video", instruction="task"), demos)
 
 
 def test_arrays_and_grey_pictures_are_read():

@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import MemoryMappedTensor
 
+from comparing import all_frames
 from ifo_grounding.data import Demonstrations, FrameCodec, _reading, _spool, codec, goal_buffer
 from ifo_grounding.data._spool import Spool
 from ifo_grounding.errors import UserError
@@ -67,10 +68,6 @@ def episodes(side=20):
     for number in range(9):
         shape = (2 + number % 3, 3, side, side)
         yield f"e{number}", torch.randint(256, shape, generator=draw, dtype=torch.uint8), "go on"
-
-
-def all_frames(demos):
-    return demos.frames(torch.arange(demos.n_frames))
 
 
 @pytest.mark.parametrize("side", [20, 32])

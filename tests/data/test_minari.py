@@ -6,7 +6,8 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from ifo_grounding.data import Demonstrations, from_minari, record_demonstrations, to_minari
+from comparing import all_frames, assert_same
+from ifo_grounding.data import Demonstrations, from_minari, to_minari
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY
 
@@ -23,22 +24,11 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "minari"
 
 
-@pytest.fixture
-def demos():
-    return record_demonstrations("move", 12, seed=0)
-
-
-def all_frames(demos):
-    return demos.frames(torch.arange(demos.n_frames))
-
-
 def test_a_dataset_comes_back_as_it_was(demos, folder):
     written = to_minari(demos, "mine/move-v0", author="me")
     assert written.total_episodes == 12
     back = from_minari("mine/move-v0", vocabulary=VOCABULARY)
-    assert back.sentences() == demos.sentences()
-    assert torch.equal(back.lengths, demos.lengths)
-    assert torch.equal(all_frames(back), all_frames(demos))
+    assert_same(back, demos)
     assert from_minari(written).vocabulary.words == tuple(
         sorted(set(" ".join(demos.sentences()).split()))
     )

@@ -6,26 +6,16 @@ import pytest
 import torch
 from PIL import Image
 
-from ifo_grounding.data import Demonstrations, load_pictures, record_demonstrations, save_pictures
+from comparing import all_frames, assert_same
+from ifo_grounding.data import Demonstrations, load_pictures, save_pictures
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
-
-
-@pytest.fixture
-def demos():
-    return record_demonstrations("move", 12, seed=0)
-
-
-def all_frames(demos):
-    return demos.frames(torch.arange(demos.n_frames))
 
 
 def test_pictures_come_back_as_they_were(demos, tmp_path):
     save_pictures(demos, tmp_path / "shown")
     back = load_pictures(tmp_path / "shown", vocabulary=VOCABULARY)
-    assert back.sentences() == demos.sentences()
-    assert torch.equal(back.lengths, demos.lengths)
-    assert torch.equal(all_frames(back), all_frames(demos))
+    assert_same(back, demos)
     assert torch.equal(back.tokens, demos.tokens)
 
 

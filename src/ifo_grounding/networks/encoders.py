@@ -146,14 +146,19 @@ class PatchEncoder(nn.Module):
         return -(-height // patch), -(-width // patch)
 
 
-def check_tokens(tokens: Tensor, words: int) -> None:
-    """Raise :class:`UserError` where a token id, of at least one, is none of so many words."""
+def without_padding(tokens: Tensor, words: int) -> Tensor:
+    """Cut [N, L], of at least one id, behind the end of the longest of its instructions.
+
+    Raises:
+        UserError: where an id is none of so many words.
+    """
     lowest, highest = tokens.aminmax()
     if lowest < 0 or highest >= words:
         raise UserError(
             f"instructions hold token ids from {int(lowest)} to {int(highest)}, but this "
             f"network knows 0 to {words - 1}: build it with the vocabulary of the data"
         )
+    return tokens[:, : max(int(sentence_lengths(tokens).max()), 1)]
 
 
 class InstructionEncoder(nn.Module):
@@ -187,9 +192,8 @@ class InstructionEncoder(nn.Module):
         distinct, inverse = distinct_rows(tokens.long())
         if not distinct.numel():
             return self.embedding.weight.new_zeros(len(distinct), self.size), inverse
-        check_tokens(distinct, self.embedding.num_embeddings)
-        longest = max(int(sentence_lengths(distinct).max()), 1)
-        return self._encode(distinct[:, :longest]), inverse
+        distinct = without_padding(distinct, self.embedding.num_embeddings)
+        return self._encode(distinct), inverse
 
     def _encode(self, tokens: Tensor) -> Tensor:
         raise NotImplementedError

@@ -20,11 +20,10 @@ from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     PatchEncoder,
     as_float,
-    check_tokens,
     distinct_patches,
     over_words,
     patches,
-    sentence_lengths,
+    without_padding,
 )
 from ifo_grounding.networks.fusion import cell_places
 from ifo_grounding.networks.shapes import Shapes, patch_size
@@ -273,8 +272,7 @@ class GroundedTrunk(nn.Module):
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
         if tokens.numel() and not hidden_from_python(tokens):
-            check_tokens(tokens, self.words.role.num_embeddings)
-            tokens = tokens[:, : max(int(sentence_lengths(tokens).max()), 1)]
+            tokens = without_padding(tokens, self.words.role.num_embeddings)
         looks = self.looks(image)
         logits, manner = self.words(looks, tokens.long())
         maps = self.weigh(logits)

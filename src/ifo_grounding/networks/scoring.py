@@ -63,11 +63,16 @@ class PairScorer(Network):
 
     def encode_pixels(self, *pixels: Tensor) -> Tensor:
         """Map images, each [*B, C, H, W], to features [*B, F, h, w] that know no instruction."""
+        images, batch = self.flat_images(*pixels)
+        with self.autocast(pixels[0]):
+            features = self._features(images)
+        return features.reshape(*batch, *features.shape[1:])
+
+    def flat_images(self, *pixels: Tensor) -> tuple[list[Tensor], torch.Size]:
+        """Return images, each [*B, C, H, W], as [N, C, H, W], and the B that they share."""
         flat = [self.flat_pixels(image) for image in pixels]
         same_batch(**{f"image {number}": batch for number, (_, batch) in enumerate(flat)})
-        with self.autocast(pixels[0]):
-            features = self._features([image for image, _ in flat])
-        return features.reshape(*flat[0][1], *features.shape[1:])
+        return [image for image, _ in flat], flat[0][1]
 
     def _features(self, images: list[Tensor]) -> Tensor:
         """Map images, each [N, C, H, W], to features [N, F, h, w]."""
@@ -154,9 +159,9 @@ class SentenceScorer(PairScorer):
 
     def encode_scenes(self, *pixels: Tensor) -> Cells | Tensor:  # noqa: D102
         if self.alone:
-            flat = [self.flat_pixels(image)[0] for image in pixels]
+            images, _ = self.flat_images(*pixels)
             with self.autocast(pixels[0]):
-                cells = distinct_cells(self.image, torch.cat(flat, -3))
+                cells = distinct_cells(self.image, torch.cat(images, -3))
             if cells is not None:
                 return cells
         return self.encode_pixels(*pixels)
@@ -225,11 +230,10 @@ class SentenceScorer(PairScorer):
     def forward(self, *inputs: Tensor) -> Tensor:  # noqa: D102
         *pixels, instruction = inputs
         if self.alone and not hidden_from_python(instruction):
-            flat = [self.flat_pixels(image) for image in pixels]
-            batch = instruction.shape[:-1]
-            same_batch(**{f"image {n}": size for n, (_, size) in enumerate(flat)}, words=batch)
+            images, batch = self.flat_images(*pixels)
+            same_batch(images=batch, instruction=instruction.shape[:-1])
             tokens = instruction.reshape(-1, instruction.shape[-1])
             words, which = distinct_instructions(self.instruction, tokens)
-            scenes = self.encode_scenes(*(image for image, _ in flat))
+            scenes = self.encode_scenes(*images)
             return self.score_candidates(scenes, words, which.unsqueeze(1)).reshape(*batch, 1)
         return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))

@@ -11,15 +11,13 @@ from torch import Tensor, nn
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import check_tokens, sentence_lengths
+from ifo_grounding.networks.encoders import without_padding
 from ifo_grounding.networks.fusion import cell_places
 from ifo_grounding.networks.grounding import MANNER, ColourAndForm, WordMaps
-from ifo_grounding.networks.scoring import PairScorer, slices
+from ifo_grounding.networks.scoring import ROWS_AT_ONCE, PairScorer, slices
 from ifo_grounding.networks.shapes import Shapes, patch_size
 from ifo_grounding.networks.trunk import grid, head, same_batch
 
-PAIRS_AT_ONCE = 1 << 12
-"""Pairs of a scene and an instruction that are computed together, to bound memory."""
 FORMS, AROUND = 8, 16
 """Sizes of what is seen of a cell by its neighbours, and of what lies around each cell."""
 
@@ -85,8 +83,7 @@ class WordScorer(PairScorer):
         which = None
         if tokens.numel() and not hidden_from_python(tokens):
             tokens, which = distinct_rows(tokens)
-            check_tokens(tokens, self.known)
-            tokens = tokens[:, : max(int(sentence_lengths(tokens).max()), 1)]
+            tokens = without_padding(tokens, self.known)
         with torch.autocast(tokens.device.type, enabled=False):
             spoken, manner = self.words.listen(tokens)
             words = torch.cat([spoken.flatten(1), manner], -1)
@@ -95,7 +92,7 @@ class WordScorer(PairScorer):
 
     def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:  # noqa: D102
         assert isinstance(scenes, Tensor)
-        rows = max(1, PAIRS_AT_ONCE // max(index.shape[1], 1))
+        rows = max(1, ROWS_AT_ONCE // max(index.shape[1], 1))
         with self.autocast(words):
             parts = [
                 self.head(self._read(scenes[some].flatten(2), words, index[some])).squeeze(-1)

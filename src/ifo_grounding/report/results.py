@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from torch import Tensor
 
-from ifo_grounding.report.tables import text_table
+from ifo_grounding.files import read_json
+from ifo_grounding.report.tables import folded, text_table
 from ifo_grounding.stats import Difference, Estimate, Rate, wilson
 
 REFERENCES = {"true_actions": "imitation of true actions", "demonstrator": "demonstrator"}
 """What no learner can or may be, by its name in the results."""
 Measured = TypeVar("Measured", Rate, Estimate, Difference)
+Key = TypeVar("Key", bound=Hashable)
 
 
 def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -122,6 +125,37 @@ def unpacked(runs: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
         bits = np.unpackbits(np.frombuffer(bytes.fromhex(result["outcomes"]), np.uint8))
         rows.append(bits[: result["rate"]["count"]].astype(bool))
     return np.stack(rows)
+
+
+def read_results(
+    folder: Path, by: Callable[[Mapping[str, Any]], Key]
+) -> dict[Key, list[dict[str, Any]]]:
+    """Read the result files of a folder, in the order of their names: the seeds of each study.
+
+    Args:
+        folder: of ``.json`` files.
+        by: says of the options of a run to which study it belongs.
+    """
+    found: dict[Key, list[dict[str, Any]]] = {}
+    for path in sorted(folder.glob("*.json")):
+        run = read_json(path)
+        found.setdefault(by(run["options"]), []).append(run)
+    return found
+
+
+def commands_note(groups: Iterable[Sequence[Mapping[str, Any]]]) -> str:
+    """Return by which command each run was made, at which commit, as a note that is folded away.
+
+    >>> run = {"command": "ifo-grounding run study", "provenance": {"commit": "abc"}}
+    >>> commands_note([[run]]).splitlines()[-1].strip()
+    '- `ifo-grounding run study` (commit `abc`)'
+    """
+    made = [
+        f"- `{run['command']}` (commit `{run['provenance']['commit']}`)"
+        for runs in groups
+        for run in runs
+    ]
+    return folded("Commands", list(dict.fromkeys(made)))
 
 
 def results_table(results: Mapping[str, Any]) -> str:
