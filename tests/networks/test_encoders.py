@@ -10,6 +10,7 @@ from ifo_grounding.networks import (
     GRUInstructionEncoder,
     PatchEncoder,
 )
+from ifo_grounding.networks.patches import distinct_windows
 
 
 def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) -> torch.Tensor:
@@ -119,6 +120,63 @@ def test_conv_encoder_is_the_papers():
     for height, width in ((48, 48), (96, 96), (33, 70)):
         features = encoder(torch.zeros(1, 3, height, width))
         assert tuple(features.shape[-2:]) == ConvEncoder.grid(height, width, 4)
+
+
+def tiled(rows, height=6, width=6, kinds=9, channels=3):
+    """Images of tiles of noise, some alike in what a neighbour sees of them."""
+    draw = torch.Generator().manual_seed(0)
+    tiles = torch.randint(256, (kinds, channels, 8, 8), generator=draw, dtype=torch.uint8)
+    tiles[1::2, :, :, 5:] = tiles[0, :, :, 5:]
+    tiles[2::3, :, 5:] = tiles[0, :, 5:]
+    which = torch.randint(kinds, (rows, height, width), generator=draw)
+    which[torch.rand(which.shape, generator=draw) < 0.6] = 0
+    cells = tiles[which].permute(0, 3, 1, 4, 2, 5)
+    return cells.reshape(rows, channels, 8 * height, 8 * width)
+
+
+@pytest.mark.parametrize("layers", [2, 3, 4])
+@pytest.mark.parametrize(("height", "width", "channels"), [(6, 6, 3), (5, 8, 1), (7, 7, 6)])
+def test_conv_encoder_computes_windows_that_repeat_once(layers, height, width, channels):
+    torch.manual_seed(0)
+    image = tiled(64, height, width, channels=channels)
+    encoder = ConvEncoder(channels, 16, layers)
+    windows = distinct_windows(image)
+    assert len(windows.pixels) < 64 * 4 * height * width / 3
+    found, expected = encoder(image), encoder.layers(image / 255)
+    assert found.shape == expected.shape
+    torch.testing.assert_close(found, expected)
+    weights = torch.randn_like(expected)
+    wanted = torch.autograd.grad((expected * weights).sum(), list(encoder.parameters()))
+    got = torch.autograd.grad((found * weights).sum(), list(encoder.parameters()))
+    for one, other in zip(got, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
+
+
+def test_windows_are_those_of_the_image():
+    image = tiled(32)
+    windows = distinct_windows(image)
+    padded = nn.functional.pad(image, (3, 0, 3, 0))
+    cut = padded.unfold(2, 7, 4).unfold(3, 7, 4).permute(0, 2, 3, 1, 4, 5)
+    assert torch.equal(windows.pixels[windows.where], cut)
+    row, column = torch.arange(12)[:, None] == 0, torch.arange(12) == 0
+    assert torch.equal(windows.top[windows.where], row.expand(32, 12, 12))
+    assert torch.equal(windows.side[windows.where], column.expand(32, 12, 12))
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        torch.randint(256, (40, 3, 48, 48), dtype=torch.uint8),  # nothing repeats
+        tiled(40, kinds=100)[:, :, 3:-5, 3:-5],  # tiles across the patches
+        tiled(8),  # few
+        tiled(64)[..., :44],
+        tiled(64) / 255,
+        tiled(0),
+    ],
+)
+def test_images_that_do_not_repeat_take_the_plain_way(image):
+    assert distinct_windows(image) is None
+    assert ConvEncoder(3, 8, 4)(image).shape == (len(image), 8, 3, 3)
 
 
 def test_patch_encoder_is_a_strided_convolution():

@@ -19,13 +19,11 @@ from ifo_grounding.networks.cells import hidden_from_python, look_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     PatchEncoder,
-    as_float,
-    distinct_patches,
     over_words,
-    patches,
     without_padding,
 )
 from ifo_grounding.networks.fusion import cell_places
+from ifo_grounding.networks.patches import as_float, distinct_patches, patches
 from ifo_grounding.networks.shapes import Shapes, patch_size
 
 EVIDENCE = 16

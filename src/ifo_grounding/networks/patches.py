@@ -1,0 +1,146 @@
+"""Patches of images, and which of them look alike: what repeats is then computed once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.networks.cells import hidden_from_python
+
+WORD = 8
+"""Pixels that are compared at once."""
+FEWEST_WINDOWS = 1 << 12
+"""Fewer windows than that are computed as fast as they are compared."""
+MOST_TILES = 1 << 15
+"""More distinct tiles than that and the numbers of their combinations could overflow."""
+
+
+def as_float(pixels: Tensor) -> Tensor:
+    """Scale uint8 pixels to [0, 1]; floating-point pixels are taken as scaled already."""
+    if pixels.dtype == torch.uint8:
+        return pixels.to(torch.get_default_dtype()).mul_(1 / 255)
+    return pixels
+
+
+def patches(image: Tensor, patch: int) -> Tensor:
+    """Cut an image [N, C, H, W] into patches [N, h, w, C * patch * patch].
+
+    An image whose sides are not multiples of the patch is padded with black to the right and below.
+
+    >>> patches(torch.zeros(2, 3, 20, 28), 8).shape
+    torch.Size([2, 3, 4, 192])
+    """
+    return _cut(_padded(image, patch), patch, patch)
+
+
+def distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
+    """Cut images into their distinct patches; None where that would not pay.
+
+    It pays on a CPU, for images of bytes in which more than half of the patches repeat.
+
+    Args:
+        image: [N, C, H, W].
+        patch: pixels along one side of a patch.
+
+    Returns:
+        Distinct patches, uint8 [U, C, patch * patch], and which lies where, int64 [N, h * w].
+    """
+    plain = image.dtype == torch.uint8 and image.device.type == "cpu"
+    if not plain or patch % WORD or hidden_from_python(image):
+        return None
+    words = _padded(image, patch).contiguous().view(torch.int64)
+    cut = _cut(words, patch, patch // WORD)
+    rows, index = distinct_rows(cut.flatten(0, 2))
+    if 2 * len(rows) > len(index):
+        return None
+    distinct = rows.view(torch.uint8).unflatten(1, (-1, patch**2))
+    return distinct, index.view(cut.shape[:3]).flatten(1)
+
+
+def _cut(image: Tensor, height: int, width: int) -> Tensor:
+    """Cut [N, C, H, W] into [N, h, w, C * height * width]."""
+    cells = image.unflatten(-1, (-1, width)).unflatten(-3, (-1, height))
+    return cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
+
+
+def _padded(image: Tensor, patch: int) -> Tensor:
+    below, right = (-size % patch for size in image.shape[-2:])
+    return F.pad(image, (0, right, 0, below)) if below or right else image
+
+
+class Windows(NamedTuple):
+    """The distinct windows of 7 x 7 pixels, 4 apart, that two strided convolutions look at."""
+
+    pixels: Tensor
+    """uint8 [U, C, 7, 7]; black where a window reaches beyond the image."""
+    top: Tensor
+    """Whether the first rows lie above the image, bool [U]."""
+    side: Tensor
+    """Whether the first columns lie beside the image, bool [U]."""
+    where: Tensor
+    """Which window lies where, int64 [N, H / 4, W / 4]."""
+
+
+def distinct_windows(image: Tensor) -> Windows | None:
+    """Find the distinct windows that begin 3 pixels before every fourth pixel, both ways.
+
+    A window of a tile of 8 pixels reaches into the last 3 pixels of the tile to the left, of the
+    one above, or of both and the one between, so windows are told apart by a few numbers of tiles.
+
+    Args:
+        image: [N, C, H, W].
+
+    Returns:
+        The windows; None where that would not pay, for they are few or half of them differ, and
+        where sides are no multiples of 8.
+
+    >>> windows = distinct_windows(torch.zeros(64, 3, 48, 48, dtype=torch.uint8))
+    >>> windows.pixels.shape, windows.where.shape
+    (torch.Size([9, 3, 7, 7]), torch.Size([64, 12, 12]))
+    """
+    rows, _, *size = image.shape
+    if any(side % WORD for side in size) or rows * size[0] * size[1] // 16 < FEWEST_WINDOWS:
+        return None
+    found = distinct_patches(image, WORD)
+    if found is None or len(found[0]) > MOST_TILES:
+        return None
+    tiles, where = found[0].view(torch.int64), found[1]  # [U, C, 8], each number a row of pixels
+    height, width = (side // WORD for side in size)
+    here = where.view(-1, height, width)
+    strips = (tiles >> 40, tiles[..., 5:], tiles[..., 5:] >> 40)  # the last 3 columns, rows, both
+    right, low, corner = (distinct_rows(strip.flatten(1))[1] + 1 for strip in strips)
+    left = F.pad(right[here[:, :, :-1]], (1, 0))  # 0 beyond the edge
+    above = F.pad(low[here[:, :-1]], (0, 0, 1, 0))
+    between = F.pad(corner[here[:, :-1, :-1]], (1, 0, 1, 0))
+
+    base = len(tiles) + 1
+    number = here * base
+    keys = torch.stack(
+        [
+            ((number + left) * base + above) * base + between,
+            (number * base + above) * base,
+            (number + left) * base**2,
+            number * base**2,
+        ]
+    )
+    keys += torch.arange(4, device=image.device).view(-1, 1, 1, 1) * base**4
+    known, index = torch.unique(keys, return_inverse=True)
+    if 2 * len(known) >= index.numel():
+        return None
+    index = index.view(2, 2, *here.shape).permute(2, 3, 0, 4, 1)  # [N, h, 2, w, 2]
+    index = index.reshape(-1, 2 * height, 2 * width)
+    place = torch.arange(index.numel(), device=image.device)
+    place = place.new_zeros(len(known)).scatter_(0, index.flatten(), place)
+
+    words = F.pad(image.contiguous().view(torch.int64), (1, 0, 3, 0)).unfold(2, 7, 4)
+    row, across = place // (2 * width) % (2 * height), place % (2 * width)
+    which = place // (4 * height * width)
+    before, inside = (words[which, :, row, across // 2 + step] for step in (0, 1))  # [U, C, 7]
+    reaching = ((before >> 40) & 0xFFFFFF) | (inside << 24)
+    pixels = torch.where((across % 2 == 1)[:, None, None], inside >> 8, reaching)
+    pixels = pixels.view(torch.uint8).unflatten(-1, (7, WORD))[..., :7]
+    return Windows(pixels, row == 0, across == 0, index)
