@@ -134,8 +134,11 @@ class Peer:
             )
             assert self._answer() == "ready"
 
-    def contender(self, work: str) -> dict[str, Once]:
-        """Return a contender that does some work of the peer's; none where it is not installed."""
+    def contender(self, work: str, name: str = "") -> dict[str, Once]:
+        """Return a contender, by default of the peer's name, that does some work of the peer's.
+
+        None where it is not installed.
+        """
         if self.process is None:
             print(f"{self.name} is not installed: `make bench` installs it", file=sys.stderr)
             return {}
@@ -144,7 +147,7 @@ class Peer:
             done, seconds = self._ask(work)
             return done, seconds
 
-        return {self.name: once}
+        return {name or self.name: once}
 
     def memory(self) -> float:
         """Return the most memory that its process has held, in MB; 0 where there is none."""

@@ -260,9 +260,14 @@ def imitation(preset: str) -> Row:
     return Row(
         "imitation, preset paper, batch 512",
         "samples/s",
-        {**ours(work), **peer.contender("train")},
+        {
+            **ours(work),
+            **peer.contender("train"),
+            **peer.contender("train ours", "imitation with our layers"),
+        },
         {"rate": 30e3, "imitation": 5},
-        "the package imitation: BC with the same network, data and batch size",
+        "the package imitation: BC with the same network, data and batch size, the network in plain"
+        " PyTorch or of our layers, which compute what repeats once",
         peers=[peer],
     )
 
