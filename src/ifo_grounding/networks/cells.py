@@ -89,7 +89,9 @@ def pair_up(cells: Tensor, instructions: Tensor, n_cells: int, n_instructions: i
 
 def look_up(table: Tensor, index: Tensor) -> Tensor:
     """Return rows of ``table`` [U, F]: [*index.shape, F]; its gradient is fast on a CPU."""
-    return F.embedding(index, table)
+    if table.device.type != "cpu":
+        return F.embedding(index, table)
+    return table.index_select(0, index.flatten()).unflatten(0, index.shape)
 
 
 def hidden_from_python(tensor: Tensor) -> bool:
