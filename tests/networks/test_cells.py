@@ -15,7 +15,7 @@ from ifo_grounding.networks import (
     make_value,
 )
 from ifo_grounding.networks import cells as cells_module
-from ifo_grounding.networks.cells import Cells, pair_up
+from ifo_grounding.networks.cells import Cells, group_cells, pair_up
 
 
 def plainly(monkeypatch) -> None:
@@ -101,6 +101,26 @@ def test_candidates_are_scored_like_pairs(scenes, monkeypatch, room):
     dense = classifier.encode_scenes(pixels)
     assert isinstance(dense, Tensor)
     torch.testing.assert_close(classifier.score_candidates(dense, words, index), expected)
+
+
+def test_groups_say_what_lies_where():
+    source = torch.Generator().manual_seed(0)
+    index, place = torch.randint(5, (7, 12), generator=source), torch.rand(12, 2, generator=source)
+    groups = group_cells(index, place)
+    assert groups.number.sum(1).tolist() == [12] * 7
+    for row in range(7):
+        kinds = index[row].unique().tolist()
+        there = groups.number[row] > 0
+        assert sorted(groups.cell[row][there].tolist()) == kinds
+        for kind, number, mean in zip(*(part[row] for part in vars(groups).values()), strict=True):
+            if number:
+                assert number == (index[row] == kind).sum()
+                torch.testing.assert_close(mean, place[index[row] == kind].mean(0))
+    twice = groups.repeated(2)
+    assert torch.equal(twice[::2].cell, groups.cell) and torch.equal(
+        twice[1::2].place, groups.place
+    )
+    assert len(group_cells(index[:0], place).cell) == 0
 
 
 @pytest.mark.parametrize("size", [(48, 48), (44, 50)])

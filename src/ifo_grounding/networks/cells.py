@@ -61,6 +61,51 @@ class Pairs:
         return Pairs(self.cell[some], self.instruction[some], self.index)
 
 
+@dataclass
+class Groups:
+    """The cells of each feature map, those that look alike counted instead of repeated."""
+
+    cell: Tensor
+    """Which distinct cell, int64 [N, J]."""
+    number: Tensor
+    """How many places show it, [N, J]; 0 where a map has fewer than J kinds of cells."""
+    place: Tensor
+    """The mean of these places, [N, J, 2]."""
+
+    def __getitem__(self, rows: Tensor | slice) -> Groups:
+        """Return the groups of some feature maps."""
+        return Groups(self.cell[rows], self.number[rows], self.place[rows])
+
+    def repeated(self, times: int) -> Groups:
+        """Return each feature map's groups several times in a row."""
+        parts = (self.cell, self.number, self.place)
+        return Groups(*(part.repeat_interleave(times, 0) for part in parts))
+
+
+def group_cells(index: Tensor, place: Tensor) -> Groups:
+    """Group the cells of feature maps that look alike.
+
+    Args:
+        index: which distinct cell lies in each cell, int64 [N, C].
+        place: of each cell, [C, 2].
+
+    >>> groups = group_cells(torch.tensor([[4, 7, 4], [5, 5, 5]]), torch.eye(3)[:, :2])
+    >>> groups.cell.tolist(), groups.number.tolist()
+    ([[4, 7], [5, 5]], [[2.0, 1.0], [3.0, 0.0]])
+    >>> groups.place[0].tolist()
+    [[0.5, 0.0], [0.0, 1.0]]
+    """
+    cells, order = index.sort(1)
+    begins = F.pad(cells[:, 1:] != cells[:, :-1], (1, 0), value=True)
+    group = begins.cumsum(1) - 1
+    size = (len(index), int(group.max()) + 1 if group.numel() else 1)
+    number = place.new_zeros(size).scatter_add_(1, group, place.new_ones(group.shape))
+    both = group.unsqueeze(-1).expand(-1, -1, 2)
+    places = place.new_zeros(*size, 2).scatter_add_(1, both, place[order])
+    cell = cells[:, :1].repeat(1, size[1]).scatter_(1, group, cells)
+    return Groups(cell, number, places / number.clamp_min(1).unsqueeze(-1))
+
+
 def pair_up(cells: Tensor, instructions: Tensor, n_cells: int, n_instructions: int) -> Pairs:
     """Find the distinct pairs of a cell and an instruction.
 

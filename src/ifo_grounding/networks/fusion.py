@@ -138,21 +138,31 @@ class SpatialReadout(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Read ``image`` [N, F, H, W]: [N, heads * (2 + values)]."""
-        return self.read(self.outlook(image).movedim(-3, -1).flatten(-3, -2))
+        logits, seen = (part.movedim(-3, -1).flatten(-3, -2) for part in self.outlook(image))
+        return self.read(logits, seen, self.place)
 
-    def outlook(self, image: Tensor) -> Tensor:
-        """Return what is read of every cell of [N, F, H, W]: [N, heads + values, H, W]."""
-        return torch.cat([self.attention(image), self.value(image)], -3)
+    def outlook(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return logits [N, heads, H, W] and values [N, values, H, W] of [N, F, H, W]."""
+        return self.attention(image), self.value(image)
 
-    def read(self, outlook: Tensor) -> Tensor:
-        """Read cells in the order of their places, [N, H * W, heads + values]."""
-        heads = self.attention.out_features
-        logits, seen = outlook[..., :heads], outlook[..., heads:]
+    def read(
+        self, logits: Tensor, seen: Tensor, place: Tensor, number: Tensor | None = None
+    ) -> Tensor:
+        """Read cells, or groups of cells that look alike.
+
+        Args:
+            logits: how much each head is drawn to a cell, [N, C, heads].
+            seen: values [N, C, values].
+            place: of a cell, or the mean of a group, [C, 2] or [N, C, 2].
+            number: of the cells of a group, [N, C]; None means one each.
+        """
+        if number is not None:
+            logits = logits + number.log().unsqueeze(-1).to(logits.dtype)
         # A softmax, written out: over a dim that is not the last one it takes twice as long.
         weights = (logits - logits.detach().amax(-2, keepdim=True)).exp()
-        weights = weights / weights.sum(-2, keepdim=True)
-        place = self.place.to(seen.dtype).expand(*seen.shape[:-1], 2)
-        return (weights.transpose(-1, -2) @ torch.cat([place, seen], -1)).flatten(-2)
+        weights = (weights / weights.sum(-2, keepdim=True)).transpose(-1, -2)
+        place = place.to(seen.dtype).expand(*seen.shape[:-1], 2)
+        return (weights @ torch.cat([place, seen], -1)).flatten(-2)
 
 
 class CellCount(nn.Module):
@@ -180,9 +190,12 @@ class CellCount(nn.Module):
         """Return what each cell of [N, F, H, W] counts for: [N, detectors, H, W]."""
         return torch.sigmoid(self.detect(image))
 
-    def read(self, outlook: Tensor) -> Tensor:
-        """Count over cells, [N, H * W, detectors]."""
-        count = outlook.sum(-2)
+    def read(self, outlook: Tensor, number: Tensor | None = None) -> Tensor:
+        """Count over cells [N, C, detectors], or over groups of ``number`` [N, C] cells each."""
+        if number is None:
+            count = outlook.sum(-2)
+        else:
+            count = (number.unsqueeze(-1).to(outlook.dtype) * outlook).sum(-2)
         return torch.cat([count, torch.tanh(count)], -1)
 
 

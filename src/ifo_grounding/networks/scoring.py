@@ -8,7 +8,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up, pair_up
+from ifo_grounding.networks.cells import (
+    Cells,
+    Groups,
+    group_cells,
+    hidden_from_python,
+    look_up,
+    pair_up,
+)
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.fusion import (
     CellCount,
@@ -172,30 +179,30 @@ class SentenceScorer(PairScorer):
         if not isinstance(scenes, Cells):
             repeated = scenes.unsqueeze(1).expand(-1, count, *scenes.shape[1:]).flatten(0, 1)
             return self.score(repeated, words[which]).reshape(rows, count)
-        places = scenes.index.repeat_interleave(count, 0)
-        pairs = pair_up(places, which, len(scenes.features), len(words))
+        groups = group_cells(scenes.index, self.readout.place).repeated(count)
+        pairs = pair_up(groups.cell, which, len(scenes.features), len(words))
         with self.autocast(words):
             parts = [
                 self._outlook(fuse_pairs(self.fusion, scenes.features, words, pairs[some]))
                 for some in slices(len(pairs), CELLS_AT_ONCE)
             ]
-            outlook = torch.cat(parts)
+            outlook = [torch.cat(part) for part in zip(*parts, strict=True)]
             outputs = [
-                self.head(self._read(look_up(outlook, pairs.index[some])))
+                self.head(self._read(outlook, pairs.index[some], groups[some]))
                 for some in slices(len(which), ROWS_AT_ONCE)
             ]
         return torch.cat(outputs).float().reshape(rows, count) + self.prior
 
-    def _outlook(self, fused: Tensor) -> Tensor:
-        """Return all that is read of each cell, [Q, ...], of features [Q, F, 1, 1]."""
-        parts = [part.outlook(fused).flatten(1) for part in (self.readout, self.count)]
-        return torch.cat(parts, -1)
+    def _outlook(self, fused: Tensor) -> list[Tensor]:
+        """Return all that is read of each cell, [Q, ...] each, of features [Q, F, 1, 1]."""
+        parts = (*self.readout.outlook(fused), self.count.outlook(fused))
+        return [part.flatten(1) for part in parts]
 
-    def _read(self, outlook: Tensor) -> Tensor:
-        """Read the cells of scenes, [N, h * w, ...]."""
-        sizes = [outlook.shape[-1] - self.config.detectors, self.config.detectors]
-        looked, counted = outlook.split(sizes, -1)
-        return torch.cat([self.readout.read(looked), self.count.read(counted)], -1)
+    def _read(self, outlook: list[Tensor], index: Tensor, groups: Groups) -> Tensor:
+        """Read the cells of scenes, which lie at ``index`` [N, J] in the tables of the outlook."""
+        logits, seen, detected = (look_up(table, index) for table in outlook)
+        looked = self.readout.read(logits, seen, groups.place, groups.number)
+        return torch.cat([looked, self.count.read(detected, groups.number)], -1)
 
     def score(self, features: Tensor, instruction: Tensor) -> Tensor:
         """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""

@@ -12,7 +12,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks.cells import Cells, Pairs, hidden_from_python, look_up, pair_up
+from ifo_grounding.networks.cells import (
+    Cells,
+    Pairs,
+    hidden_from_python,
+    look_up,
+    pair_up,
+)
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     ConvEncoder,
@@ -219,8 +225,9 @@ class Trunk(nn.Module):
                 words, which = distinct_instructions(self.instruction, tokens)
                 pairs = pair_up(cells.index, which, len(cells.features), len(words))
                 fused = fuse_pairs(self.fusion, cells.features, words, pairs)
-                outlook = self.readout.outlook(fused).flatten(1)
-                return self.readout.read(look_up(outlook, pairs.index))
+                parts = (part.flatten(1) for part in self.readout.outlook(fused))
+                logits, seen = (look_up(part, pairs.index) for part in parts)
+                return self.readout.read(logits, seen, self.readout.place)
         return self.readout(self.fuse(image, tokens))
 
 
