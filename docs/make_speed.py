@@ -20,7 +20,7 @@ OURS = "ifo-grounding"
 ORDER = (
     *("step", "pixels", "rollout", "gymnasium", "collector-strong", "collector-paper", "sampler"),
     *("imitation-strong", "imitation-paper", "labelling", "transitions", "recording", "memory"),
-    "growth",
+    *("whole", "growth"),
 )
 """Of the rows in the table; others come last."""
 
@@ -77,6 +77,15 @@ def short(value: float) -> str:
     return f"{value:.3g}"
 
 
+def fact(value: float) -> str:
+    """Return a number with as many digits as it needs.
+
+    >>> fact(952268), fact(99.95)
+    ('952,268', '99.95')
+    """
+    return f"{value:,.0f}" if value == round(value) else f"{value:,.4g}"
+
+
 def section() -> str:
     """Return the tables."""
     rows = measured()
@@ -90,7 +99,7 @@ def section() -> str:
     rates = [shown for row in rows.values() if row["rates"] for shown in lines(row)]
     notes = [f"- {row['name']}: {row['note']}." for row in rows.values() if row["note"]]
     facts = [
-        {"what": row["name"], "measured": name, "value": f"{value:,.0f}"}
+        {"what": row["name"], "measured": name, "value": fact(value)}
         for row in rows.values()
         for name, value in row["facts"].items()
     ]
