@@ -238,7 +238,7 @@ def sampler() -> Row:
 
 
 def imitation(preset: str) -> Row:
-    size, steps = (512, 6) if preset == "paper" else (256, 20)
+    size, steps = (512, 12) if preset == "paper" else (256, 100)
     demos, _ = record_demonstrations("move", 2000, seed=0, keep_truth=True)
     # How fast a network learns does not depend on the labels; these are random.
     actions = torch.randint(6, (demos.transitions,), dtype=torch.uint8)

@@ -91,11 +91,12 @@ def section() -> str:
     rows = measured()
     if not rows:
         return "Not run."
-    made = {
-        f"{row['provenance']['machine']}, {row['provenance']['threads']} threads, torch "
-        f"{row['provenance']['torch']}, commit `{row['provenance']['commit']}`"
-        for row in rows.values()
-    }
+    made: dict[str, dict[str, None]] = {}
+    for row in rows.values():
+        of = row["provenance"]
+        machine = f"{of['machine']}, {of['threads']} threads, torch {of['torch']}"
+        made.setdefault(machine, {})[f"`{of['commit']}`"] = None
+    machines = [f"{machine}, commits {', '.join(commits)}" for machine, commits in made.items()]
     rates = [shown for row in rows.values() if row["rates"] for shown in lines(row)]
     notes = [f"- {row['name']}: {row['note']}." for row in rows.values() if row["note"]]
     facts = [
@@ -103,7 +104,7 @@ def section() -> str:
         for row in rows.values()
         for name, value in row["facts"].items()
     ]
-    parts = ["; ".join(sorted(made)) + ".", markdown_table(rates)]
+    parts = ["; ".join(machines) + ".", markdown_table(rates)]
     parts += [markdown_table(facts)] if facts else []
     parts += ["\n".join(notes)] if notes else []
     return "\n\n".join(parts)
