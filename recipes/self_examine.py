@@ -24,7 +24,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import networks
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.data import labelled_buffer
+from ifo_grounding.data import labelled_buffer, recombined
 from ifo_grounding.objectives import ImitationLoss, RewardLoss
 from ifo_grounding.training import Adversary, Rehearsal, select_pairs, self_examine
 from ifo_grounding.training.run import Run
@@ -114,6 +114,8 @@ def chosen_starts(run: Run, options: DictConfig) -> InstructionSampler | Startin
     """Return fresh states with chosen instructions, or the paper's fixed number of pairs."""
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
     pool = load_demonstrations(run).pool()
+    if options.self_examine.recombine:
+        pool = torch.cat([pool, recombined(pool)])
     section = options.instruction
     chosen = {name: section[name] for name in ("threshold", "candidates", "choose")}
     if options.self_examine.pairs is None:

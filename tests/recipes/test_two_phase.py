@@ -16,7 +16,11 @@ PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
     [
         ("move", "strong", []),
         ("pick-udlr", "paper", ["self_examine.pairs=24"]),
-        ("move-udlr", "grounded", ["world.split=train", "evaluate.split=zero-shot"]),
+        (
+            "move-udlr",
+            "grounded",
+            ["world.split=train", "evaluate.split=zero-shot", "self_examine.recombine=true"],
+        ),
         ("pick-out", "strong", ["self_examine.kind=both", "self_examine.reward_steps=1"]),
     ],
 )
