@@ -245,25 +245,22 @@ def zero_shot_content() -> str:
 
 
 def readme_tables() -> str:
-    """Return the short form of Tables 2 and 3, the paper beside our best preset."""
+    """Return the short form of Tables 2 and 3, the paper beside our better presets."""
     found = pieces()
-    rows = []
+    rows, suitable = [], []
     for task in TASKS:
         before, *after = TABLE_2[task]
-        first, practised = (found.get((task, "strong", name)) for name in ("phase-1", "pairs-5000"))
-        row = {
-            "task": task,
-            "the paper, phase 1 / best phase 2": f"{before:.1f}% / {max(after):.1f}%",
-            "phase 1": success(first, "phase1"),
-            "phase 2": success(practised, "phase2").split("<br>")[0],
-            "suitable: the paper": f"{TABLE_3[task]:.1f}%",
-        }
+        rows.append({"task": task, "paper, 1 / best 2": f"{before:.1f}% / {max(after):.1f}%"})
+        suitable.append({"task": task, "paper": f"{TABLE_3[task]:.1f}%"})
         for preset in ("strong", "grounded"):
-            runs = found.get((task, preset, "phase-1"), [])
-            chosen = [run["results"]["suitability"]["rate"]["rate"] for run in runs]
-            row[f"suitable: `{preset}`"] = mean(chosen, 1) if chosen else NOT_RUN
-        rows.append(row)
-    return table(rows)
+            first, practised = (
+                found.get((task, preset, phase)) for phase in ("phase-1", "pairs-5000")
+            )
+            rows[-1][f"`{preset}`, 1"] = success(first, "phase1")
+            rows[-1][f"`{preset}`, 2"] = success(practised, "phase2").split("<br>")[0]
+            chosen = [run["results"]["suitability"]["rate"]["rate"] for run in first or []]
+            suitable[-1][f"`{preset}`"] = mean(chosen, 1) if chosen else NOT_RUN
+    return f"{table(rows)}\n\nSuitable instructions among those chosen:\n\n{table(suitable)}"
 
 
 def readme_zero_shot() -> str:

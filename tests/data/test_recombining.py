@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ifo_grounding.data import record_demonstrations, recombined
+from ifo_grounding.data import recombined, record_demonstrations
 from ifo_grounding.tasks import TASKS, VOCABULARY
 from ifo_grounding.tasks.grammar import HOLDOUTS
 
