@@ -15,7 +15,7 @@ from ifo_grounding.networks import (
     make_value,
 )
 from ifo_grounding.networks import cells as cells_module
-from ifo_grounding.networks.cells import Cells, group_cells, pair_up
+from ifo_grounding.networks.cells import Cells, Kinds, group_cells, pair_up
 
 
 def plainly(monkeypatch) -> None:
@@ -82,6 +82,31 @@ def test_two_images_at_once(scenes, monkeypatch):
     torch.testing.assert_close(quick, plain)
 
 
+@pytest.mark.parametrize("make", [make_instruction_classifier, make_goal_judge])
+def test_scenes_are_read_by_kinds_of_cells_as_cell_by_cell(make, scenes):
+    pixels, tokens, shapes = scenes
+    network = make(shapes, "grounded", seed=0).module
+    images = (pixels, pixels.flip(0))[: network.images]
+    index = torch.randint(len(tokens), (len(pixels), 5), generator=torch.Generator().manual_seed(0))
+
+    def scored(*images):
+        words = network.encode_instruction(tokens)
+        return network.score_candidates(network.encode_scenes(*images), words, index)
+
+    def cell_by_cell(*images):
+        words = network.encode_instruction(tokens)
+        return network.score_candidates(network.encode_pixels(*images), words, index)
+
+    assert isinstance(network.encode_scenes(*images), Kinds)
+    network.forward = scored
+    quick, gradients = outputs_and_gradients(network, *images)
+    network.forward = cell_by_cell
+    plain, expected = outputs_and_gradients(network, *images)
+    torch.testing.assert_close(quick, plain)
+    for name, gradient in gradients.items():
+        torch.testing.assert_close(gradient, expected[name], atol=1e-5, rtol=1e-4)
+
+
 @pytest.mark.parametrize("room", [1 << 22, 0])
 def test_candidates_are_scored_like_pairs(scenes, monkeypatch, room):
     monkeypatch.setattr(cells_module, "ROOM", room)
@@ -117,9 +142,7 @@ def test_groups_say_what_lies_where():
                 assert number == (index[row] == kind).sum()
                 torch.testing.assert_close(mean, place[index[row] == kind].mean(0))
     twice = groups.repeated(2)
-    assert torch.equal(twice[::2].cell, groups.cell) and torch.equal(
-        twice[1::2].place, groups.place
-    )
+    assert torch.equal(twice[::2].cell, groups.cell) and torch.equal(twice[1::2].mean, groups.mean)
     assert len(group_cells(index[:0], place).cell) == 0
 
 

@@ -69,41 +69,63 @@ class Groups:
     """Which distinct cell, int64 [N, J]."""
     number: Tensor
     """How many places show it, [N, J]; 0 where a map has fewer than J kinds of cells."""
-    place: Tensor
-    """The mean of these places, [N, J, 2]."""
+    mean: Tensor
+    """The mean of what else is known of these places, [N, J, D]."""
 
     def __getitem__(self, rows: Tensor | slice) -> Groups:
         """Return the groups of some feature maps."""
-        return Groups(self.cell[rows], self.number[rows], self.place[rows])
+        return Groups(self.cell[rows], self.number[rows], self.mean[rows])
 
     def repeated(self, times: int) -> Groups:
         """Return each feature map's groups several times in a row."""
-        parts = (self.cell, self.number, self.place)
+        parts = (self.cell, self.number, self.mean)
         return Groups(*(part.repeat_interleave(times, 0) for part in parts))
 
 
-def group_cells(index: Tensor, place: Tensor) -> Groups:
+def group_cells(index: Tensor, known: Tensor) -> Groups:
     """Group the cells of feature maps that look alike.
 
     Args:
         index: which distinct cell lies in each cell, int64 [N, C].
-        place: of each cell, [C, 2].
+        known: what else is known of each cell, such as its place, [C, D] or [N, C, D].
 
     >>> groups = group_cells(torch.tensor([[4, 7, 4], [5, 5, 5]]), torch.eye(3)[:, :2])
     >>> groups.cell.tolist(), groups.number.tolist()
     ([[4, 7], [5, 5]], [[2.0, 1.0], [3.0, 0.0]])
-    >>> groups.place[0].tolist()
+    >>> groups.mean[0].tolist()
     [[0.5, 0.0], [0.0, 1.0]]
     """
     cells, order = index.sort(1)
     begins = F.pad(cells[:, 1:] != cells[:, :-1], (1, 0), value=True)
     group = begins.cumsum(1) - 1
     size = (len(index), int(group.max()) + 1 if group.numel() else 1)
-    number = place.new_zeros(size).scatter_add_(1, group, place.new_ones(group.shape))
-    both = group.unsqueeze(-1).expand(-1, -1, 2)
-    places = place.new_zeros(*size, 2).scatter_add_(1, both, place[order])
+    number = known.new_zeros(size).scatter_add_(1, group, known.new_ones(group.shape))
     cell = cells[:, :1].repeat(1, size[1]).scatter_(1, group, cells)
-    return Groups(cell, number, places / number.clamp_min(1).unsqueeze(-1))
+    if known.ndim == 2:
+        known = known.expand(len(index), -1, -1)
+    of = torch.empty_like(group).scatter_(1, order, group)  # the group of each cell
+    share = F.one_hot(of, size[1]).to(known.dtype) / number.clamp_min(1).unsqueeze(1)
+    return Groups(cell, number, share.transpose(1, 2) @ known)
+
+
+@dataclass
+class Kinds:
+    """Scenes by the kinds of cells that they show."""
+
+    features: Tensor
+    """[N, F, C], as those of a feature map."""
+    place: Tensor
+    """The mean place of each kind, [N, C, 2]."""
+    number: Tensor
+    """How many cells are of each kind, [N, C]; 0 where a scene shows fewer than C."""
+
+    def __len__(self) -> int:
+        """Return the number of scenes."""
+        return len(self.features)
+
+    def __getitem__(self, rows: Tensor | slice) -> Kinds:
+        """Return some of the scenes."""
+        return Kinds(self.features[rows], self.place[rows], self.number[rows])
 
 
 def pair_up(cells: Tensor, instructions: Tensor, n_cells: int, n_instructions: int) -> Pairs:

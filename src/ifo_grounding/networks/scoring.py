@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from ifo_grounding.networks.cells import (
     Cells,
     Groups,
+    Kinds,
     group_cells,
     hidden_from_python,
     look_up,
@@ -89,15 +90,17 @@ class PairScorer(Network):
         """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
         raise NotImplementedError
 
-    def encode_scenes(self, *pixels: Tensor) -> Cells | Tensor:
+    def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:
         """Encode images, each [N, C, H, W], for :meth:`score_candidates`.
 
         Returns:
-            Features [N, F, h, w], or the distinct cells where these repeat and that pays.
+            Features [N, F, h, w], or what stands for them where cells repeat and that pays.
         """
         return self.encode_pixels(*pixels)
 
-    def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:
+    def score_candidates(
+        self, scenes: Cells | Kinds | Tensor, words: Tensor, index: Tensor
+    ) -> Tensor:
         """Score some instructions of a pool for each scene.
 
         Args:
@@ -164,7 +167,7 @@ class SentenceScorer(PairScorer):
     def encode_instruction(self, instruction: Tensor) -> Tensor:  # noqa: D102
         return encode_instruction(self.instruction, instruction)
 
-    def encode_scenes(self, *pixels: Tensor) -> Cells | Tensor:  # noqa: D102
+    def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:  # noqa: D102
         if self.alone:
             images, _ = self.flat_images(*pixels)
             with self.autocast(pixels[0]):
@@ -173,12 +176,16 @@ class SentenceScorer(PairScorer):
                 return cells
         return self.encode_pixels(*pixels)
 
-    def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:  # noqa: D102
+    def score_candidates(
+        self, scenes: Cells | Kinds | Tensor, words: Tensor, index: Tensor
+    ) -> Tensor:
+        """Score some instructions of a pool for each scene: logits [N, K]; see the base class."""
         rows, count = index.shape
         which = index.flatten()
-        if not isinstance(scenes, Cells):
+        if isinstance(scenes, Tensor):
             repeated = scenes.unsqueeze(1).expand(-1, count, *scenes.shape[1:]).flatten(0, 1)
             return self.score(repeated, words[which]).reshape(rows, count)
+        assert isinstance(scenes, Cells)
         groups = group_cells(scenes.index, self.readout.place).repeated(count)
         pairs = pair_up(groups.cell, which, len(scenes.features), len(words))
         with self.autocast(words):
@@ -201,7 +208,7 @@ class SentenceScorer(PairScorer):
     def _read(self, outlook: list[Tensor], index: Tensor, groups: Groups) -> Tensor:
         """Read the cells of scenes, which lie at ``index`` [N, J] in the tables of the outlook."""
         logits, seen, detected = (look_up(table, index) for table in outlook)
-        looked = self.readout.read(logits, seen, groups.place, groups.number)
+        looked = self.readout.read(logits, seen, groups.mean, groups.number)
         return torch.cat([looked, self.count.read(detected, groups.number)], -1)
 
     def score(self, features: Tensor, instruction: Tensor) -> Tensor:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up
+from ifo_grounding.networks.cells import Cells, Kinds, group_cells, hidden_from_python, look_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import without_padding
 from ifo_grounding.networks.fusion import cell_places
@@ -20,6 +21,19 @@ from ifo_grounding.networks.trunk import grid, head, same_batch
 
 FORMS, AROUND = 8, 16
 """Sizes of what is seen of a cell by its neighbours, and of what lies around each cell."""
+
+
+class Seen(NamedTuple):
+    """What is seen of the distinct cells of an image."""
+
+    said: Tensor
+    """What each word says of them, [U, V]."""
+    silent: Tensor
+    """What the heads and values see that hear no words, [U, heads + values]."""
+    forms: Tensor
+    """What their neighbours see of them, [U, FORMS]."""
+    where: Tensor
+    """Which of them lies in each cell, int64 [N, h * w]."""
 
 
 class WordScorer(PairScorer):
@@ -59,23 +73,57 @@ class WordScorer(PairScorer):
 
     def _features(self, images: list[Tensor]) -> Tensor:
         """Map images [N, C, H, W] to features [N, images * V + heads + values + AROUND, h, w]."""
-        said, silent = [], []
+        tables = self._tables(images)
+        said = [look_up(table.said, table.where) for table in tables]
+        silent = sum(look_up(table.silent, table.where) for table in tables)
+        features = torch.cat([*said, silent + self._bias(), self._surroundings(tables)], -1)
+        return features.movedim(1, -1).unflatten(-1, grid(self.shapes, self.config))
+
+    def _tables(self, images: list[Tensor]) -> list[Seen]:
+        """See the distinct cells of each image."""
         heads = (self.attention, self.value, self.form)
         weight = torch.cat([part.weight for part in heads])
+        tables = []
         for image, part in zip(images, weight.chunk(self.images, -1), strict=True):
             looks = self.looks(image)
             colour, form = self.words.evidence(looks)
-            said.append(look_up(colour + form, looks.where))
-            silent.append(look_up(F.linear(looks.silhouette, part), looks.where))
-        seen = torch.stack(silent).sum(0) + torch.cat([part.bias for part in heads])
-        size = grid(self.shapes, self.config)
-        seen, forms = (
-            part.unflatten(1, size).movedim(-1, 1)
-            for part in seen.split([seen.shape[-1] - FORMS, FORMS], -1)
-        )
-        around = F.relu(self.around(F.relu(forms)))
-        words = torch.cat(said, -1).unflatten(1, size).movedim(-1, 1)
-        return torch.cat([words, seen, around], 1)
+            silent = F.linear(looks.silhouette, part)
+            silent, forms = silent.split([silent.shape[-1] - FORMS, FORMS], -1)
+            tables.append(Seen(colour + form, silent, forms, looks.where))
+        return tables
+
+    def _bias(self) -> Tensor:
+        return torch.cat([self.attention.bias, self.value.bias])
+
+    def _surroundings(self, tables: list[Seen]) -> Tensor:
+        """Return what lies around each cell, [N, h * w, AROUND]."""
+        forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
+        forms = forms.unflatten(1, grid(self.shapes, self.config)).movedim(-1, 1)
+        return F.relu(self.around(F.relu(forms))).flatten(2).transpose(1, 2)
+
+    def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:
+        """Encode images, each [N, C, H, W], those of their cells that look alike once."""
+        if hidden_from_python(pixels[0]):
+            return self.encode_pixels(*pixels)
+        images, _ = self.flat_images(*pixels)
+        with self.autocast(pixels[0]):
+            tables = self._tables(images)
+            around = self._surroundings(tables)
+            index = tables[0].where
+            for table in tables[1:]:
+                index = index * len(table.said) + table.where
+            place = self.place.to(around.dtype).expand(len(around), -1, -1)
+            groups = group_cells(index, torch.cat([place, around], -1))
+            cells: list[Tensor] = []
+            numbers = groups.cell
+            for table in reversed(tables):
+                cells.insert(0, numbers % len(table.said))
+                numbers = numbers // len(table.said)
+            seen = list(zip(tables, cells, strict=True))
+            said = [look_up(table.said, own) for table, own in seen]
+            silent = sum(look_up(table.silent, own) for table, own in seen)
+            features = torch.cat([*said, silent + self._bias(), groups.mean[..., 2:]], -1)
+        return Kinds(features.transpose(1, 2), groups.mean[..., :2], groups.number)
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
         """Map token ids [*B, L] to how much each word counts, and the manner: [*B, D]."""
@@ -90,40 +138,57 @@ class WordScorer(PairScorer):
         words = words if which is None else look_up(words, which)
         return words.reshape(*instruction.shape[:-1], words.shape[-1])
 
-    def score_candidates(self, scenes: Cells | Tensor, words: Tensor, index: Tensor) -> Tensor:  # noqa: D102
-        assert isinstance(scenes, Tensor)
+    def score_candidates(
+        self, scenes: Cells | Kinds | Tensor, words: Tensor, index: Tensor
+    ) -> Tensor:
+        """Score some instructions of a pool for each scene: logits [N, K]; see the base class."""
+        if isinstance(scenes, Tensor):
+            cells = scenes.flatten(2)
+            number = cells.new_ones(cells.shape[-1]).expand(len(cells), -1)
+            scenes = Kinds(cells, self.place.expand(len(cells), -1, -1), number)
+        assert isinstance(scenes, Kinds)
         rows = max(1, ROWS_AT_ONCE // max(index.shape[1], 1))
         with self.autocast(words):
             parts = [
-                self.head(self._read(scenes[some].flatten(2), words, index[some])).squeeze(-1)
+                self.head(self._read(scenes[some], words, index[some])).squeeze(-1)
                 for some in slices(len(index), rows)
             ]
         return torch.cat(parts).float() + self.prior
 
-    def _read(self, cells: Tensor, words: Tensor, index: Tensor) -> Tensor:
-        """Read cells [N, F, h * w] in the light of some instructions [N, K]: [N, K, size]."""
+    def _read(self, scenes: Kinds, words: Tensor, index: Tensor) -> Tensor:
+        """Read N scenes in the light of some instructions [N, K]: [N, K, size]."""
+        cells, place = scenes.features, scenes.place.to(scenes.features.dtype)
+        number = scenes.number.to(cells.dtype)  # [N, C]
+        each = number.clamp_min(1)
         count, maps = index.shape[1], self.config.maps
         spoken, manner = words[:, :-MANNER], words[:, -MANNER:]
         weights = spoken.unflatten(1, (self.known, maps)).transpose(1, 2)[index]  # [N, K, maps, V]
         said = cells[:, : self.images * self.known].unflatten(1, (self.images, self.known))
-        told = weights.flatten(1, 2).unsqueeze(1) @ said  # [N, images, K * maps, h * w]
+        told = weights.flatten(1, 2).unsqueeze(1) @ said  # [N, images, K * maps, C]
         logits = told.unflatten(2, (count, maps)).transpose(1, 2).flatten(2, 3)
-        looked = torch.cat([logits, -logits], 2).softmax(-1)  # [N, K, 2 * images * maps, h * w]
+        prior = number.log()
+        both = torch.cat([logits, -logits], 2)
+        looked = (both + prior[..., None, None, :]).softmax(-1)  # [N, K, 2 * images * maps, C]
         silent, around = cells[:, self.images * self.known :].split(
             [cells.shape[1] - self.images * self.known - AROUND, AROUND], 1
         )
         heads = self.attention.out_features
-        attention = silent[:, :heads].softmax(-1)  # [N, heads, h * w]
-        place = self.place.to(cells.dtype)
+        attention = (silent[:, :heads] + prior[..., None, :]).softmax(-1)  # [N, heads, C]
         seen = torch.cat([attention @ place, attention @ silent[:, heads:].transpose(1, 2)], -1)
-        beside = looked.flatten(1, 2) @ attention.transpose(1, 2)  # [N, K * maps, heads]
-        fits = torch.sigmoid(self.scale[:, None] * logits + self.bias[:, None]).sum(-1)
+        shared = (attention / each[..., None, :]).transpose(1, 2)
+        beside = looked.flatten(1, 2) @ shared  # [N, K * 2 * images * maps, heads]
+        there = torch.cat([place, around.transpose(1, 2)], -1)
+        where, what = (
+            (looked.flatten(1, 2) @ there).unflatten(1, looked.shape[1:3]).split([2, AROUND], -1)
+        )
+        fit = torch.sigmoid(self.scale[:, None] * logits + self.bias[:, None])
+        fits = (fit * number[..., None, None, :]).sum(-1)
         parts = [
             seen.flatten(1).unsqueeze(1).expand(-1, count, -1),
             beside.unflatten(1, looked.shape[1:3]).flatten(2),
-            (looked @ place).flatten(2),
-            (looked @ around.transpose(1, 2).unsqueeze(1)).flatten(2),
-            looked.amax(-1),
+            where.flatten(2),
+            what.flatten(2),
+            (looked / each[..., None, None, :]).amax(-1),
             fits,
             torch.tanh(fits),
             manner[index],
@@ -145,3 +210,11 @@ class WordScorer(PairScorer):
             for part in features.split(max(1, chunk // max(len(instruction), 1)))
         ]
         return torch.cat(parts)
+
+    def forward(self, *inputs: Tensor) -> Tensor:  # noqa: D102
+        *pixels, instruction = inputs
+        images, batch = self.flat_images(*pixels)
+        same_batch(images=batch, instruction=instruction.shape[:-1])
+        words = self.encode_instruction(instruction.reshape(-1, instruction.shape[-1]))
+        own = torch.arange(len(words), device=words.device).unsqueeze(1)
+        return self.score_candidates(self.encode_scenes(*images), words, own).reshape(*batch, 1)
