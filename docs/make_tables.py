@@ -25,6 +25,7 @@ PAGE = ROOT / "docs" / "tables.md"
 README = ROOT / "README.md"
 ZERO_SHOT = ROOT / "docs" / "zero-shot.md"
 PARTS = ROOT / "results" / "zero-shot"
+RECOMBINED = ROOT / "results" / "recombined"
 ABLATIONS = ROOT / "results" / "ablations"
 PRESETS = ("paper", "strong", "grounded")
 PAPER_EPISODES = 500
@@ -337,6 +338,35 @@ def parts_content() -> str:
     return "\n\n".join([table(rows), commands_note(found.values())])
 
 
+PRACTISED = {"own": "the demonstrations' alone", "recombined": "recombined ones too"}
+"""Which instructions phase 2 practises, by variant."""
+
+
+def recombined_content() -> str:
+    """Return the table of what practising recombined instructions does."""
+    found: Pieces = read_results(RECOMBINED, lambda o: (o["network"], o["variant"]))
+    rows = []
+    for preset in PRESETS:
+        for variant, said in PRACTISED.items():
+            if runs := found.get((preset, variant)):
+                first, last = (outcomes(runs, name) for name in ("phase1", "phase2"))
+                trained = [run["results"]["trained"]["phase2"]["counts"] for run in runs]
+                shares = [counts["success"] / sum(counts.values()) for counts in trained]
+                rows.append(
+                    {
+                        "preset": f"`{preset}`",
+                        "practises": said,
+                        "seeds": str(len(runs)),
+                        "phase 1": brief(two_level_bootstrap(first)),
+                        "phase 2": brief(two_level_bootstrap(last)),
+                        "gain, points": brief(paired_difference(first, last)),
+                        "trained pairs, phase 2": mean(shares, 1),
+                    }
+                )
+    notes = commands_note(found.values())
+    return "\n\n".join(part for part in (table(rows), notes) if part)
+
+
 def part_row(said: str, runs: list[dict[str, Any]]) -> dict[str, str]:
     """Return what a variant does and sees."""
     found = [run["results"] for run in runs]
@@ -361,7 +391,12 @@ def written() -> dict[Path, str]:
     """Return what each page should say."""
     tables = renewed(PAGE.read_text(), "tables", f"\n\n{content()}\n\n")
     zero_shot = ZERO_SHOT.read_text()
-    for mark, part in (("zero-shot", zero_shot_content()), ("parts", parts_content())):
+    parts = {
+        "zero-shot": zero_shot_content(),
+        "parts": parts_content(),
+        "recombined": recombined_content(),
+    }
+    for mark, part in parts.items():
         zero_shot = renewed(zero_shot, mark, f"\n\n{part}\n\n")
     readme = renewed(README.read_text(), "zero-shot", f"\n{readme_zero_shot()}\n")
     readme = renewed(readme, "paper", f"\n{readme_tables()}\n")

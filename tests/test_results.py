@@ -37,7 +37,7 @@ def test_every_result_says_where_it_comes_from():
     script = load_script()
     studied = [run for seeds in script.studies().values() for run in seeds]
     studied += [run for seeds in load_script("make_tables").pieces().values() for run in seeds]
-    for folder in ("babyai", "zero-shot"):
+    for folder in ("babyai", "recombined", "zero-shot"):
         studied += [read_json(path) for path in (ROOT / "results" / folder).glob("*.json")]
     for run in [*script.runs(), *studied]:
         commands = ("run study", "run zero_shot", "evaluate") if run in studied else ("demo",)

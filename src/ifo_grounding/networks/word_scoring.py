@@ -74,9 +74,8 @@ class WordScorer(PairScorer):
     def _features(self, images: list[Tensor]) -> Tensor:
         """Map images [N, C, H, W] to features [N, images * V + heads + values + AROUND, h, w]."""
         tables = self._tables(images)
-        said = [look_up(table.said, table.where) for table in tables]
-        silent = sum(look_up(table.silent, table.where) for table in tables)
-        features = torch.cat([*said, silent + self._bias(), self._surroundings(tables)], -1)
+        seen = self._seen(tables, [table.where for table in tables])
+        features = torch.cat([seen, self._surroundings(tables)], -1)
         return features.movedim(1, -1).unflatten(-1, grid(self.shapes, self.config))
 
     def _tables(self, images: list[Tensor]) -> list[Seen]:
@@ -92,8 +91,12 @@ class WordScorer(PairScorer):
             tables.append(Seen(colour + form, silent, forms, looks.where))
         return tables
 
-    def _bias(self) -> Tensor:
-        return torch.cat([self.attention.bias, self.value.bias])
+    def _seen(self, tables: list[Seen], cells: list[Tensor]) -> Tensor:
+        """Look up what is seen of some cells of each image, int64 [N, C]: [N, C, F - AROUND]."""
+        both = list(zip(tables, cells, strict=True))
+        said = [look_up(table.said, own) for table, own in both]
+        silent = sum(look_up(table.silent, own) for table, own in both)
+        return torch.cat([*said, silent + torch.cat([self.attention.bias, self.value.bias])], -1)
 
     def _surroundings(self, tables: list[Seen]) -> Tensor:
         """Return what lies around each cell, [N, h * w, AROUND]."""
@@ -119,10 +122,7 @@ class WordScorer(PairScorer):
             for table in reversed(tables):
                 cells.insert(0, numbers % len(table.said))
                 numbers = numbers // len(table.said)
-            seen = list(zip(tables, cells, strict=True))
-            said = [look_up(table.said, own) for table, own in seen]
-            silent = sum(look_up(table.silent, own) for table, own in seen)
-            features = torch.cat([*said, silent + self._bias(), groups.mean[..., 2:]], -1)
+            features = torch.cat([self._seen(tables, cells), groups.mean[..., 2:]], -1)
         return Kinds(features.transpose(1, 2), groups.mean[..., :2], groups.number)
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
