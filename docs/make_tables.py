@@ -95,20 +95,20 @@ def success_rows(
 
 
 def suitability_rows(found: Pieces) -> list[dict[str, str]]:
-    """Return the rows of Table 3."""
+    """Return the rows of Table 3: the paper's rates and ours."""
+    heads = {"rate": "suitable", "served": "served", "servable": "at most"}
     rows = []
     for task in TASKS:
-        row = {"task": task, "the paper": f"{TABLE_3[task]:.1f}%"}
+        blank = dict.fromkeys(heads.values(), "")
+        told = {**blank, "suitable": f"{TABLE_3[task]:.1f}%"}
+        rows.append({"task": f"**{task}**", "by": "the paper", **told})
         for preset in PRESETS:
             runs = found.get((task, preset, "phase-1"), [])
-            for name, title in (
-                ("rate", "suitable"),
-                ("served", "served"),
-                ("servable", "at most"),
-            ):
+            row = {"task": "", "by": f"`{preset}`"}
+            for name, title in heads.items():
                 values = [brief(restored(Rate, r["results"]["suitability"][name])) for r in runs]
-                row[f"`{preset}`: {title}"] = "<br>".join(values) or NOT_RUN
-        rows.append(row)
+                row[title] = "<br>".join(values) or NOT_RUN
+            rows.append(row)
     return rows
 
 
