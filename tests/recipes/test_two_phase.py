@@ -129,3 +129,12 @@ def test_every_recipe_has_options_that_begin_with_its_command(recipes):
         first = (recipes / "conf" / f"{script.stem}.yaml").read_text().splitlines()[0]
         assert first.startswith(f"# python recipes/{script.name}"), script.name
         assert Path(script).read_text().startswith('"""')
+
+
+@pytest.mark.parametrize(("preset", "schedule"), [("paper", "constant"), ("strong", "cosine")])
+def test_the_papers_learning_rate_does_not_decay(compose, preset, schedule):
+    from _shared import fit_config
+
+    options = compose("two_phase", f"preset={preset}")
+    for section in ("inverse", "imitate", "instruction", "reward", "goal"):
+        assert fit_config(options[section]).schedule == schedule
