@@ -15,7 +15,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import torch
-from measuring import Peer, Row, median_time, peak_memory, resident_memory, timed
+from measuring import ROOT, Peer, Row, median_time, peak_memory, resident_memory, timed
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
@@ -338,7 +338,7 @@ def remember(path: str) -> dict[str, float]:
 def whole() -> Row:
     """Train both phases as `ifo-grounding demo` does, from random steps to the practised policy."""
     with tempfile.TemporaryDirectory() as home:
-        recipe = Path(__file__).parents[1] / "recipes" / "two_phase.py"
+        recipe = ROOT / "recipes" / "two_phase.py"
         options = [f"threads={torch.get_num_threads()}", f"device={DEVICE}", "progress=false"]
         subprocess.run(
             [sys.executable, str(recipe), "task=move", "seed=0", "run=whole", *options],

@@ -98,14 +98,13 @@ def group_cells(index: Tensor, known: Tensor) -> Groups:
     cells, order = index.sort(1)
     begins = F.pad(cells[:, 1:] != cells[:, :-1], (1, 0), value=True)
     group = begins.cumsum(1) - 1
-    size = (len(index), int(group.max()) + 1 if group.numel() else 1)
-    number = known.new_zeros(size).scatter_add_(1, group, known.new_ones(group.shape))
-    cell = cells[:, :1].repeat(1, size[1]).scatter_(1, group, cells)
-    if known.ndim == 2:
-        known = known.expand(len(index), -1, -1)
+    kinds = int(group.max()) + 1 if group.numel() else 1
+    cell = cells[:, :1].repeat(1, kinds).scatter_(1, group, cells)
     of = torch.empty_like(group).scatter_(1, order, group)  # the group of each cell
-    share = F.one_hot(of, size[1]).to(known.dtype) / number.clamp_min(1).unsqueeze(1)
-    return Groups(cell, number, share.transpose(1, 2) @ known)
+    member = F.one_hot(of, kinds).to(known.dtype)
+    number = member.sum(1)
+    mean = member.transpose(1, 2) @ known / number.clamp_min(1).unsqueeze(-1)
+    return Groups(cell, number, mean)
 
 
 @dataclass

@@ -34,12 +34,12 @@ class ConvEncoder(nn.Module):
     def __init__(self, channels: int, features: int, layers: int) -> None:
         super().__init__()
         sizes = [channels] + [features] * layers
-        self.convolutions = [
-            nn.Conv2d(before, after, 3, stride=2, padding=1)
-            for before, after in itertools.pairwise(sizes)
-        ]
         self.layers = nn.Sequential(
-            *(part for layer in self.convolutions for part in (layer, nn.ReLU()))
+            *(
+                part
+                for before, after in itertools.pairwise(sizes)
+                for part in (nn.Conv2d(before, after, 3, stride=2, padding=1), nn.ReLU())
+            )
         )
 
     def forward(self, image: Tensor) -> Tensor:
@@ -51,7 +51,7 @@ class ConvEncoder(nn.Module):
 
     def _two_layers(self, windows: Windows) -> Tensor:
         """Map windows to what the first two layers make of each, [U, F]."""
-        first, second = self.convolutions[:2]
+        first, second, *_ = (part for part in self.layers if isinstance(part, nn.Conv2d))
         seen = windows.pixels.unfold(2, 3, 2).unfold(3, 3, 2)  # [U, C, 3, 3, 3, 3]
         seen = as_float(seen.permute(0, 2, 3, 1, 4, 5).flatten(3))
         features = F.relu(F.linear(seen, first.weight.flatten(1), first.bias))

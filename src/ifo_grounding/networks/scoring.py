@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.networks.cells import (
     Cells,
     Groups,
@@ -30,7 +31,6 @@ from ifo_grounding.networks.trunk import (
     Network,
     cells_are_alone,
     distinct_cells,
-    distinct_instructions,
     encode_instruction,
     flatten_cells,
     fuse_pairs,
@@ -127,7 +127,13 @@ class PairScorer(Network):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Score images, each [*B, C, H, W], with token ids [*B, L], the last input."""
         *pixels, instruction = inputs
-        return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))
+        if hidden_from_python(instruction):
+            return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))
+        images, batch = self.flat_images(*pixels)
+        same_batch(images=batch, instruction=instruction.shape[:-1])
+        tokens, which = distinct_rows(instruction.reshape(-1, instruction.shape[-1]).long())
+        scenes, words = self.encode_scenes(*images), self.encode_instruction(tokens)
+        return self.score_candidates(scenes, words, which.unsqueeze(1)).reshape(*batch, 1)
 
 
 class SentenceScorer(PairScorer):
@@ -240,14 +246,3 @@ class SentenceScorer(PairScorer):
             for part in pairs.split(chunk)
         ]
         return torch.cat(parts).reshape(scenes, pool) if parts else features.new_zeros(scenes, pool)
-
-    def forward(self, *inputs: Tensor) -> Tensor:  # noqa: D102
-        *pixels, instruction = inputs
-        if self.alone and not hidden_from_python(instruction):
-            images, batch = self.flat_images(*pixels)
-            same_batch(images=batch, instruction=instruction.shape[:-1])
-            tokens = instruction.reshape(-1, instruction.shape[-1])
-            words, which = distinct_instructions(self.instruction, tokens)
-            scenes = self.encode_scenes(*images)
-            return self.score_candidates(scenes, words, which.unsqueeze(1)).reshape(*batch, 1)
-        return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))

@@ -210,11 +210,3 @@ class WordScorer(PairScorer):
             for part in features.split(max(1, chunk // max(len(instruction), 1)))
         ]
         return torch.cat(parts)
-
-    def forward(self, *inputs: Tensor) -> Tensor:  # noqa: D102
-        *pixels, instruction = inputs
-        images, batch = self.flat_images(*pixels)
-        same_batch(images=batch, instruction=instruction.shape[:-1])
-        words = self.encode_instruction(instruction.reshape(-1, instruction.shape[-1]))
-        own = torch.arange(len(words), device=words.device).unsqueeze(1)
-        return self.score_candidates(self.encode_scenes(*images), words, own).reshape(*batch, 1)
