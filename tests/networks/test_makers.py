@@ -1,5 +1,7 @@
 """What every network must do, whatever it is for."""
 
+import functools
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -154,3 +156,14 @@ def test_bf16_stays_near_fp32(kind, preset, shapes):
     assert rough.dtype == torch.float32
     assert not torch.equal(rough, exact)
     torch.testing.assert_close(rough, exact, atol=0.03, rtol=0.05)
+
+
+def test_precision_is_the_callers_unless_it_is_given(kind, preset, shapes):
+    data = inputs(shapes, [4])
+    make = functools.partial(MAKERS[kind], shapes, preset, seed=0)
+    exact, _ = run(kind, make(precision="fp32"), data)
+    assert torch.equal(run(kind, make(), data)[0], exact)
+    rough, _ = run(kind, make(precision="bf16"), data)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(run(kind, make(), data)[0], rough)
+        assert torch.equal(run(kind, make(precision="fp32"), data)[0], exact)

@@ -56,14 +56,15 @@ class NetworkConfig:
     """Dropout rate before each linear layer of the head."""
     head_hidden: tuple[int, ...]
     """Sizes of the head's hidden layers."""
-    precision: str = "auto"
-    """``"fp32"``, ``"bf16"``, or ``"auto"``: bf16 where the hardware computes in it."""
+    precision: str | None = None
+    """``"fp32"``, ``"bf16"``, or ``"auto"``: bf16 where the hardware computes in it. None leaves it
+    to the caller: float32, unless inside ``torch.autocast``."""
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, PRESETS)
         check_choice("matching", self.matching, ("sentence", "words"))
         check_choice("words", self.words, ("gru", "conv"))
-        check_choice("precision", self.precision, ("auto", "fp32", "bf16"))
+        check_choice("precision", self.precision, (None, "auto", "fp32", "bf16"))
         for name in ("features", "embedding", "hidden"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")

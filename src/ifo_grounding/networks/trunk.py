@@ -12,13 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks.cells import (
-    Cells,
-    Pairs,
-    hidden_from_python,
-    look_up,
-    pair_up,
-)
+from ifo_grounding.networks.cells import Cells, Pairs, hidden_from_python, look_up, pair_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import (
     ConvEncoder,
@@ -48,9 +42,9 @@ def bf16_is_native(device_type: str) -> bool:
 
 
 @contextlib.contextmanager
-def autocast(device_type: str, precision: str) -> Iterator[None]:
-    """Compute in ``precision``; ``"auto"`` without native bf16 leaves the caller's choice."""
-    if precision == "auto" and not bf16_is_native(device_type):
+def autocast(device_type: str, precision: str | None) -> Iterator[None]:
+    """Compute in ``precision``; None, or ``"auto"`` without native bf16, is the caller's choice."""
+    if precision is None or (precision == "auto" and not bf16_is_native(device_type)):
         yield
         return
     with torch.autocast(device_type, torch.bfloat16, enabled=precision != "fp32"):
