@@ -10,7 +10,7 @@ from ifo_grounding.networks import (
     GRUInstructionEncoder,
     PatchEncoder,
 )
-from ifo_grounding.networks.patches import distinct_windows
+from ifo_grounding.networks.patches import distinct_blocks, distinct_windows
 
 
 def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) -> torch.Tensor:
@@ -136,12 +136,15 @@ def tiled(rows, height=6, width=6, kinds=9, channels=3):
 
 @pytest.mark.parametrize("layers", [2, 3, 4])
 @pytest.mark.parametrize(("height", "width", "channels"), [(6, 6, 3), (5, 8, 1), (7, 7, 6)])
-def test_conv_encoder_computes_windows_that_repeat_once(layers, height, width, channels):
+@pytest.mark.parametrize("zoom", [1, 3])  # enlarged, what the later layers look at repeats too
+def test_conv_encoder_computes_windows_that_repeat_once(layers, height, width, channels, zoom):
     torch.manual_seed(0)
-    image = tiled(64, height, width, channels=channels)
+    image = tiled(64 // zoom, height, width, channels=channels)
+    image = image.repeat_interleave(zoom, -1).repeat_interleave(zoom, -2)
     encoder = ConvEncoder(channels, 16, layers)
     windows = distinct_windows(image)
-    assert len(windows.pixels) < 64 * 4 * height * width / 3
+    assert len(windows.pixels) < windows.where.numel() / 3
+    assert zoom == 1 or distinct_blocks(windows.where)
     found, expected = encoder(image), encoder.layers(image / 255)
     assert found.shape == expected.shape
     torch.testing.assert_close(found, expected)
@@ -150,6 +153,16 @@ def test_conv_encoder_computes_windows_that_repeat_once(layers, height, width, c
     got = torch.autograd.grad((found * weights).sum(), list(encoder.parameters()))
     for one, other in zip(got, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
+
+
+def test_blocks_are_those_of_the_map():
+    where = torch.randint(2, (64, 6, 5))
+    where[:, :3] = 0
+    blocks, which = distinct_blocks(where)
+    cut = nn.functional.pad(where + 1, (1, 1, 1, 1)).unfold(1, 3, 2).unfold(2, 3, 2)
+    assert torch.equal(blocks[which], cut.flatten(3))
+    assert len(blocks.unique(dim=0)) == len(blocks)
+    assert distinct_blocks(torch.arange(360).view(2, 12, 15)) is None
 
 
 def test_windows_are_those_of_the_image():

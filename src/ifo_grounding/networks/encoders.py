@@ -16,6 +16,7 @@ from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up
 from ifo_grounding.networks.patches import (
     Windows,
     as_float,
+    distinct_blocks,
     distinct_patches,
     distinct_windows,
     patches,
@@ -25,7 +26,7 @@ from ifo_grounding.networks.patches import (
 class ConvEncoder(nn.Module):
     """Convolutions of kernel 3, stride 2, padding 1 with ReLU (the paper's experimental settings).
 
-    Where windows of the image repeat, the first two layers, 80% of the work, see each once.
+    Where what a layer looks at repeats, over a batch of images, the layer sees it once.
 
     >>> ConvEncoder(3, features=32, layers=4)(torch.zeros(2, 3, 48, 48)).shape
     torch.Size([2, 32, 3, 3])
@@ -47,19 +48,14 @@ class ConvEncoder(nn.Module):
         windows = distinct_windows(image) if len(self.layers) > 2 else None
         if windows is None:
             return self.layers(as_float(image))
-        return self.layers[4:](look_up(self._two_layers(windows), windows.where).movedim(-1, 1))
-
-    def _two_layers(self, windows: Windows) -> Tensor:
-        """Map windows to what the first two layers make of each, [U, F]."""
-        first, second, *_ = (part for part in self.layers if isinstance(part, nn.Conv2d))
-        seen = windows.pixels.unfold(2, 3, 2).unfold(3, 3, 2)  # [U, C, 3, 3, 3, 3]
-        seen = as_float(seen.permute(0, 2, 3, 1, 4, 5).flatten(3))
-        features = F.relu(F.linear(seen, first.weight.flatten(1), first.bias))
-        inside = features.new_ones(len(features), 3, 3, 1)
-        inside[windows.top, 0] = 0  # the second layer sees zeros beyond the edges
-        inside[windows.side, :, 0] = 0
-        weight = second.weight.permute(0, 2, 3, 1).flatten(1)
-        return F.relu(F.linear((features * inside).flatten(1), weight, second.bias))
+        first, second, *others = (part for part in self.layers if isinstance(part, nn.Conv2d))
+        features, where = _two_layers(first, second, windows), windows.where
+        while others and (found := distinct_blocks(where)):
+            blocks, where = found
+            seen = look_up(F.pad(features, (0, 0, 1, 0)), blocks)  # zeros beyond the edges
+            features = _on_blocks(others.pop(0), seen)
+        rest = self.layers[len(self.layers) - 2 * len(others) :]
+        return rest(look_up(features, where).movedim(-1, 1))
 
     @staticmethod
     def grid(height: int, width: int, layers: int) -> tuple[int, int]:
@@ -67,6 +63,22 @@ class ConvEncoder(nn.Module):
         for _ in range(layers):
             height, width = (height + 1) // 2, (width + 1) // 2
         return height, width
+
+
+def _two_layers(first: nn.Conv2d, second: nn.Conv2d, windows: Windows) -> Tensor:
+    """Map windows to what two convolutions of kernel 3 and stride 2 make of each, [U, F]."""
+    seen = as_float(windows.pixels).contiguous(memory_format=torch.channels_last)
+    features = F.relu(F.conv2d(seen, first.weight, first.bias, stride=2)).permute(0, 2, 3, 1)
+    inside = features.new_ones(len(features), 3, 3, 1)
+    inside[windows.top, 0] = 0  # the second layer sees zeros beyond the edges
+    inside[windows.side, :, 0] = 0
+    return _on_blocks(second, features * inside)
+
+
+def _on_blocks(layer: nn.Conv2d, seen: Tensor) -> Tensor:
+    """Apply a convolution of kernel 3 and a ReLU to what it sees at some places, [U, 3, 3, F]."""
+    weight = layer.weight.permute(0, 2, 3, 1).flatten(1)
+    return F.relu(F.linear(seen.flatten(1), weight, layer.bias))
 
 
 class PatchEncoder(nn.Module):

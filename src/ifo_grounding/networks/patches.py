@@ -144,3 +144,25 @@ def distinct_windows(image: Tensor) -> Windows | None:
     pixels = torch.where((across % 2 == 1)[:, None, None], inside >> 8, reaching)
     pixels = pixels.view(torch.uint8).unflatten(-1, (7, WORD))[..., :7]
     return Windows(pixels, row == 0, across == 0, index)
+
+
+def distinct_blocks(where: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Find the distinct blocks of 3 x 3 places that begin beside every second place, both ways.
+
+    Args:
+        where: what lies where, int64 [N, h, w].
+
+    Returns:
+        The blocks, int64 [U, 9], each what lies at its places plus 1, or 0 beyond the edge, and
+        which block lies where, int64 [N, (h + 1) // 2, (w + 1) // 2]; None where half of them
+        differ, so that this would not pay.
+
+    >>> blocks, which = distinct_blocks(torch.zeros(8, 4, 4, dtype=torch.int64))
+    >>> len(blocks), which.shape
+    (4, torch.Size([8, 2, 2]))
+    """
+    seen = F.pad(where + 1, (1, 1, 1, 1)).unfold(1, 3, 2).unfold(2, 3, 2).flatten(3)
+    blocks, index = distinct_rows(seen.flatten(0, 2))
+    if 2 * len(blocks) >= len(index):
+        return None
+    return blocks, index.view(seen.shape[:3])
