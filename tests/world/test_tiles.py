@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.world import WorldState, random_layout, render, step, tile_index, tile_table
+from ifo_grounding.world import (
+    Canvas,
+    WorldState,
+    random_layout,
+    render,
+    step,
+    tile_index,
+    tile_table,
+)
 from ifo_grounding.world.tiles import N_TILES, PALETTE, TILE_SIZES
 
 SIZES = (8, 16, 32)
@@ -120,3 +128,19 @@ def test_an_unknown_tile_size_is_refused():
     assert TILE_SIZES == SIZES
     with pytest.raises(UserError, match="8, 16, 32"):
         render(WorldState.empty(1), 12)
+
+
+@pytest.mark.parametrize("size", TILE_SIZES)
+@pytest.mark.parametrize("worlds", [8, 256])  # drawn anew, and where cells changed
+def test_a_canvas_shows_what_is_rendered(size, worlds):
+    canvas, state = Canvas(size), random_layout(worlds)
+    for turn in range(12):
+        if turn == 6:  # some worlds begin anew, and then all of them
+            state[: worlds // 8] = random_layout(worlds // 8)
+        if turn == 9:
+            state = random_layout(worlds)
+        drawn = canvas.draw(state)
+        assert torch.equal(drawn, render(state, size))
+        drawn.zero_()  # is the caller's own
+        state = step(state, torch.randint(6, (worlds,)))
+    assert torch.equal(canvas.draw(state[:5]), render(state[:5], size))

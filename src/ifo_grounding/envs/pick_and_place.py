@@ -169,7 +169,7 @@ class PickAndPlaceEnv(EnvBase):
             if numbers is not None:
                 numbers = numbers.reshape(self.num_envs)[rows]
             self.simulator.reset(rows, numbers)
-        result = self._observe(None if len(rows) == self.num_envs else rows)
+        result = self._observe()
         for name in ("done", "terminated", "truncated"):
             result[name] = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return result
@@ -177,19 +177,16 @@ class PickAndPlaceEnv(EnvBase):
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        """Put the images of new episodes beside those of running ones.
+        """Keep the images of all rows, new and running ones, as the reset drew them.
 
-        EnvBase chooses between them pixel by pixel, which takes longer than all else in a step.
+        EnvBase chooses between old and new pixel by pixel, which takes longer than all else in a
+        step. Only where states can be given does the caller know better than the simulator.
         """
-        if tensordict is None:
+        if self.expose_state or tensordict is None or keys.PIXELS not in tensordict:
             return super()._reset_proc_data(tensordict, tensordict_reset)
-        mask = tensordict.get("_reset", None)
-        if mask is None or mask.all() or keys.PIXELS not in tensordict:
-            return super()._reset_proc_data(tensordict, tensordict_reset)
-        rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
-        drawn = tensordict_reset.pop(keys.PIXELS)
-        pixels = _with_rows(tensordict.pop(keys.PIXELS).clone(), rows, drawn[rows])
-        return super()._reset_proc_data(tensordict, tensordict_reset).set(keys.PIXELS, pixels)
+        pixels = tensordict_reset.pop(keys.PIXELS)
+        merged = super()._reset_proc_data(tensordict.exclude(keys.PIXELS), tensordict_reset)
+        return merged.set(keys.PIXELS, pixels)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
@@ -204,13 +201,9 @@ class PickAndPlaceEnv(EnvBase):
         result["truncated"] = truncated.unsqueeze(-1)
         return result
 
-    def _observe(self, rows: Tensor | None = None) -> TensorDict:
-        """Observe all rows; where ``rows`` is given, the others may hold anything."""
+    def _observe(self) -> TensorDict:
         result = TensorDict({}, batch_size=self.batch_size, device=self.device)
-        drawn = self.simulator.pixels(rows)
-        if rows is not None:
-            drawn = _with_rows(drawn.new_zeros(self.num_envs, *drawn.shape[1:]), rows, drawn)
-        result[keys.PIXELS] = drawn
+        result[keys.PIXELS] = self.simulator.pixels()
         if self.instructed:
             result[keys.INSTRUCTION] = self.simulator.instruction.clone()
         if self.expose_state:
@@ -244,9 +237,3 @@ class PickAndPlaceEnv(EnvBase):
     def render(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
         """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
         return self.simulator.pixels(tile_size=tile_size).permute(0, 2, 3, 1).cpu().numpy()
-
-
-def _with_rows(pixels: Tensor, rows: Tensor, drawn: Tensor) -> Tensor:
-    """Write the images ``drawn`` into some rows of ``pixels``, eight pixels at a time."""
-    pixels.view(torch.int64).index_copy_(0, rows, drawn.view(torch.int64))
-    return pixels

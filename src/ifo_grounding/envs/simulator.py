@@ -9,7 +9,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
 from ifo_grounding.tasks.goals import fulfilled
 from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
-from ifo_grounding.world import render, step
+from ifo_grounding.world import Canvas, render, step
 
 
 class Simulator:
@@ -36,6 +36,7 @@ class Simulator:
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.numbers = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.scene: Scene | None = None
+        self._canvas = Canvas(tile_size)
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
@@ -100,5 +101,7 @@ class Simulator:
     def pixels(self, rows: Tensor | None = None, tile_size: int | None = None) -> Tensor:
         """Draw some rows or all of them, uint8 [R, 3, H, W]."""
         assert self.scene is not None, "reset before drawing"
+        if rows is None and tile_size is None:
+            return self._canvas.draw(self.scene.state)
         state = self.scene.state if rows is None else self.scene.state[rows]
         return render(state, tile_size or self.tile_size)

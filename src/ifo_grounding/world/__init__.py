@@ -12,7 +12,7 @@ from ifo_grounding.world.state import (
     kind,
     kind_name,
 )
-from ifo_grounding.world.tiles import render, tile_index, tile_table
+from ifo_grounding.world.tiles import Canvas, render, tile_index, tile_table
 
 __all__ = [
     "BOX_COLOURS",
@@ -20,6 +20,7 @@ __all__ = [
     "N_BOXES",
     "N_KINDS",
     "SHAPES",
+    "Canvas",
     "Layout",
     "WorldState",
     "kind",
