@@ -313,6 +313,11 @@ def zero_shot_row(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
 VARIANTS = {
     "whole": "the preset",
     "sentence": "preset `strong`: the instruction as one vector",
+    "sentence-narrow": "the same, 16 features instead of 64",
+    "sentence-dropout": "the same, dropout of 0.5",
+    "sentence-decay": "the same, weight decay of 1",
+    "sentence-early": "the same, stopped after a quarter of the steps",
+    "sentence-jitter": "the same, brightness of each colour channel drawn anew at every step",
     "cells-whole": "words see whole cells, not colour and form",
     "silent-whole": "what hears no words sees colours too",
     "no-charge": "speaking is free",

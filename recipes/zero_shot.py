@@ -1,10 +1,13 @@
 """Zero-shot, one part at a time: what the preset `grounded` owes to each of its parts.
 
+And what common remedies do for `strong`, which hears a sentence as one vector.
+
 python recipes/zero_shot.py task=move seed=0
 """
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -18,10 +21,12 @@ from imitate import best_beginning, labelled_demonstrations
 from label import label
 from omegaconf import DictConfig
 from record_demonstrations import record
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 from train_inverse import train_inverse
 
+from ifo_grounding import keys
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.errors import check_choice
 from ifo_grounding.evaluation import episode_endings, probe
@@ -87,9 +92,38 @@ CHANGES: dict[str, Callable[[GroundedTrunk, ImitationLoss], None]] = {
     "no-noise": no_noise,
     "one-way": one_way,
 }
-WHOLE, SENTENCE = "whole", "sentence"
-VARIANTS = (WHOLE, SENTENCE, *CHANGES)
-"""The whole preset, the preset `strong`, and what is changed in one part alone."""
+
+
+class JitteredLoss(ImitationLoss):
+    """Imitates pictures whose colour channels are brighter or darker, drawn anew at each step."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        pixels = tensordict.get(keys.PIXELS)
+        gain = torch.empty(pixels.shape[-3], 1, 1, device=pixels.device).uniform_(0.5, 1.5)
+        seen = (pixels * gain).clamp_(0, 255).to(torch.uint8)
+        return super().forward(tensordict.copy().set(keys.PIXELS, seen))
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """What is changed of the preset `strong`, or of how it learns."""
+
+    network: dict[str, Any] = field(default_factory=dict)
+    imitate: dict[str, Any] = field(default_factory=dict)
+    loss: type[ImitationLoss] = ImitationLoss
+
+
+SENTENCES = {
+    "sentence": Sentence(),
+    "sentence-narrow": Sentence(network={"features": 16}),
+    "sentence-dropout": Sentence(network={"dropout": 0.5}),
+    "sentence-decay": Sentence(imitate={"weight_decay": 1.0}),
+    "sentence-early": Sentence(imitate={"steps": 300, "trials": 1}),
+    "sentence-jitter": Sentence(loss=JitteredLoss),
+}
+WHOLE = "whole"
+VARIANTS = (WHOLE, *CHANGES, *SENTENCES)
+"""The whole preset, what is changed in one part alone, and the preset `strong` with remedies."""
 
 
 def compare(options: DictConfig) -> dict[str, dict]:
@@ -104,6 +138,9 @@ def compare(options: DictConfig) -> dict[str, dict]:
 
 def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
     """Imitate with one variant and keep what was measured."""
+    if name in SENTENCES:
+        options = options.copy()
+        options.imitate.update(SENTENCES[name].imitate)
     stage = open_stage(options, f"zero-shot-{name}", ["imitate", "evaluate"], ["label"])
     results = stage.result
     if results is None:
@@ -117,9 +154,12 @@ def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
 
 def beginning(name: str, options: DictConfig, seed: int) -> ImitationLoss:
     """Build a variant with the initial weights of a seed."""
-    preset = "strong" if name == SENTENCE else "grounded"
     world = open_world(options).simulator()
-    loss = ImitationLoss(make_policy(world, preset, seed=seed, device=options.device))
+    if name in SENTENCES:
+        what = SENTENCES[name]
+        policy = make_policy(world, "strong", seed=seed, device=options.device, **what.network)
+        return what.loss(policy)
+    loss = ImitationLoss(make_policy(world, "grounded", seed=seed, device=options.device))
     if name in CHANGES:
         trunk = trunk_of(loss.network)
         assert isinstance(trunk, GroundedTrunk)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
@@ -44,7 +45,7 @@ def test_variants_leave_a_file_each_and_are_made_once(options, tmp_path):
 
 
 def test_each_variant_changes_what_it_says(options):
-    from zero_shot import CHANGES, SENTENCE, WHOLE, beginning
+    from zero_shot import CHANGES, WHOLE, beginning
 
     from ifo_grounding.networks.transfer import trunk_of
 
@@ -72,4 +73,39 @@ def test_each_variant_changes_what_it_says(options):
             "no-charge": (True, True, False),
         }
         assert same == expected[name], name
-    assert answers(SENTENCE)[0].shape != trained.shape
+    assert answers("sentence")[0].shape != trained.shape
+
+
+def test_remedies_of_the_sentence_network_change_it_or_how_it_learns(options, tmp_path):
+    from zero_shot import SENTENCES, beginning, compare
+
+    given = options()
+    sizes, dropouts = {}, {}
+    for name in SENTENCES:
+        policy = beginning(name, given, 0).network
+        sizes[name] = sum(weight.numel() for weight in policy.parameters())
+        dropouts[name] = {part.p for part in policy.modules() if isinstance(part, torch.nn.Dropout)}
+    assert sizes["sentence-narrow"] < sizes["sentence"] == sizes["sentence-dropout"]
+    assert dropouts["sentence-dropout"] == {0.5} != dropouts["sentence"]
+    compare(options("variants=[sentence-decay]"))
+    kept = read_json(tmp_path / "move-60-grounded-sentence-decay-seed0.json")
+    assert kept["results"]["trained"]["rate"]["count"] == 30
+
+
+def test_jitter_changes_brightness_and_not_what_the_loss_is_given(options):
+    from zero_shot import beginning
+
+    batch = TensorDict(
+        {
+            "pixels": torch.full((4, 3, 48, 48), 100, dtype=torch.uint8),
+            "instruction": torch.ones(4, 16, dtype=torch.int64),
+            "action": torch.zeros(4, dtype=torch.int64),
+        },
+        [4],
+    )
+    loss = beginning("sentence-jitter", options(), 0)
+    plain = beginning("sentence", options(), 0)
+    assert plain(batch)["loss_imitation"] == plain(batch)["loss_imitation"]
+    seen = [loss(batch)["loss_imitation"].item() for _ in range(2)]
+    assert seen[0] != seen[1]
+    assert (batch["pixels"] == 100).all()
