@@ -15,7 +15,7 @@ from _shared import (
 )
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig, OmegaConf
-from self_examine import needs, practice
+from self_examine import guard, needs, practice
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
@@ -74,7 +74,8 @@ def imitate_on(
     if section.select_every:
         # Before any rollout, so that it remembers the first starts.
         chosen = self_examination_config(section)
-        selection = Selection(env, policy, chosen.selection, options.seed)
+        seen = guard(policy, stage.run, options)
+        selection = Selection(env, policy, chosen.selection, options.seed, seen)
         selection.look()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)
         iteration = options.imitate.get("iteration", FitConfig.iteration)

@@ -26,7 +26,7 @@ from ifo_grounding import networks
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import labelled_buffer, recombined
 from ifo_grounding.objectives import ImitationLoss, RewardLoss
-from ifo_grounding.training import Adversary, Rehearsal, select_pairs, self_examine
+from ifo_grounding.training import Adversary, Guard, Rehearsal, select_pairs, self_examine
 from ifo_grounding.training.run import Run
 from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
 
@@ -48,6 +48,7 @@ def examine(options: DictConfig) -> dict:
         seed=options.seed,
         adversary=adversary,
         rehearsal=rehearsal(policy, run, options),
+        guard=guard(policy, run, options),
         checkpoint=stage.checkpoint,
         log=stage.log(),
         callback=audit_callback(policy, reward, run, options),
@@ -73,6 +74,12 @@ def rehearsal(policy: nn.Module, run: Run, options: DictConfig) -> Rehearsal | N
         return None
     seen, _ = labelled_demonstrations(run, options.imitate.held_out)
     return Rehearsal(ImitationLoss(policy), seen, weight)
+
+
+def guard(policy: Any, run: Run, options: DictConfig) -> Guard | None:
+    """Return what asks the demonstrations that were held out from phase 1, if some were."""
+    _, aside = labelled_demonstrations(run, options.imitate.held_out)
+    return None if aside is None else Guard(policy, aside)
 
 
 def practice(

@@ -3,6 +3,7 @@
 from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
 from ifo_grounding.training.cloning import accepted, accepted_steps
+from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.held_out import HeldOut
 from ifo_grounding.training.pairs import load_pairs, save_pairs, select_pairs
 from ifo_grounding.training.rehearsal import Rehearsal
@@ -15,6 +16,7 @@ __all__ = [
     "Adversary",
     "Checkpoint",
     "FitConfig",
+    "Guard",
     "HeldOut",
     "Rehearsal",
     "Run",

@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from ifo_grounding import keys
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.environment import reseed, sampler_stats, transforms_of
+from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.supervised import Metrics
 
 
@@ -131,6 +132,7 @@ class Selection:
         policy: plays greedily.
         schedule: when to look, and for how long.
         seed: of the starts.
+        guard: refuses weights with which the policy goes astray, whatever their return.
     """
 
     metric = "selection_return"
@@ -141,8 +143,10 @@ class Selection:
         policy: nn.Module,
         schedule: SelectionSchedule,
         seed: int,
+        guard: Guard | None = None,
     ) -> None:
         self.env, self.policy, self.schedule, self.seed = env, policy, schedule, seed
+        self.guard = guard
         self.best = BestPolicy(policy, schedule.margin)
         self.fixed = [t for t in transforms_of(env) if getattr(t, "fixes_scenes", False)]
         self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
@@ -153,14 +157,13 @@ class Selection:
         last = done == schedule.iterations
         if not schedule.every or (done % schedule.every and not last):
             return {}
-        kept, mean = self._consider()
-        return {self.metric: mean, "selected": float(kept)}
+        return self._consider()
 
     def look(self) -> float:
         """Return the mean learned return, and remember the weights if it is high enough."""
-        return self._consider()[1]
+        return self._consider()[self.metric]
 
-    def _consider(self) -> tuple[bool, float]:
+    def _consider(self) -> Metrics:
         schedule = self.schedule
         present = copy.deepcopy([starts.state_dict() for starts in self.fixed])
         for starts, first in zip(self.fixed, self.first_starts, strict=True):
@@ -174,7 +177,11 @@ class Selection:
         sampler_stats(self.env)
         for starts, state in zip(self.fixed, present, strict=True):
             starts.load_state_dict(state)
-        return self.best.consider(returns), float(returns.mean())
+        found = {self.metric: float(returns.mean())}
+        astray = False
+        if self.guard:
+            found["held_out_agreement"], astray = self.guard.look()
+        return {**found, "selected": float(not astray and self.best.consider(returns))}
 
     def restore(self) -> None:
         """Give the policy the best weights back."""
@@ -182,8 +189,11 @@ class Selection:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a checkpoint has to keep."""
-        return self.best.state_dict()
+        guard = {"guard": self.guard.state_dict()} if self.guard else {}
+        return {**self.best.state_dict(), **guard}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
         self.best.load_state_dict(state)
+        if self.guard:
+            self.guard.load_state_dict(state["guard"])

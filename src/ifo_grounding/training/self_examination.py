@@ -29,6 +29,7 @@ from ifo_grounding.training.environment import (
     summary,
     transforms_of,
 )
+from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.rehearsal import Rehearsal
 from ifo_grounding.training.selection import Selection, SelectionSchedule
 from ifo_grounding.training.supervised import Callback, Log, Metrics, make_optimizer, update
@@ -114,6 +115,7 @@ def self_examine(
     seed: int,
     adversary: Adversary | None = None,
     rehearsal: Rehearsal | None = None,
+    guard: Guard | None = None,
     checkpoint: str | Path | None = None,
     log: Log | None = None,
     callback: Callback | None = None,
@@ -132,6 +134,7 @@ def self_examine(
             from a reset: a run continues from its checkpoint to the same result.
         adversary: trains the reward model on, with the steps of each iteration.
         rehearsal: imitates the demonstrations on.
+        guard: keeps policies from being selected that go astray of held-out demonstrations.
         checkpoint: file to continue from and to save to.
         log: gets the metrics of each iteration.
         callback: gets the iteration, returns further metrics; the place for audits.
@@ -149,7 +152,7 @@ def self_examine(
     value.eval()
     learner = _Learner(env, policy, value, config, rehearsal)
     sampler_stats(env)  # forgets the reset that a collector begins with
-    selection = Selection(env, policy, config.selection, seed)
+    selection = Selection(env, policy, config.selection, seed, guard)
     parts: dict[str, Any] = {
         "loss": learner.loss,
         "optimizer": learner.optimizer,

@@ -1,0 +1,92 @@
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from ifo_grounding.data import Demonstrations, labelled_buffer
+from ifo_grounding.errors import UserError
+from ifo_grounding.training import Guard, self_examine
+from training.test_self_examination import config, likes, make_env, make_networks
+
+LENGTHS = (3, 5, 2) * 20
+
+
+def held_out(action, lengths=LENGTHS):
+    """Demonstrations of some lengths in which every label is one action."""
+    draw = torch.Generator().manual_seed(0)
+    frames = [
+        torch.randint(256, (length, 3, 48, 48), dtype=torch.uint8, generator=draw)
+        for length in lengths
+    ]
+    demos = Demonstrations.from_arrays(frames, ["move to the red circle"] * len(lengths))
+    actions = torch.full((demos.transitions,), action)
+    return labelled_buffer(demos, actions)
+
+
+class Sometimes(torch.nn.Module):
+    """Takes action 1 in bright images and, at other times, action 0 as often as it is told to."""
+
+    def __init__(self):
+        super().__init__()
+        self.wrong = 0
+
+    def forward(self, state):
+        action = torch.ones(state.batch_size, dtype=torch.int64)
+        action[: self.wrong] = 0
+        return state.set("action", action)
+
+
+def test_each_demonstration_counts_once():
+    policy = Sometimes()
+    guard = Guard(policy, held_out(1, (3, 5, 2)))
+    policy.wrong = 3  # both transitions of the first, one of four of the second
+    assert guard.agreement().tolist() == [0.0, 0.75, 1.0]
+    assert Guard(policy, held_out(0, (3, 5, 2)), batch_size=100).agreement().tolist() == [
+        1,
+        0.25,
+        0,
+    ]
+
+
+def test_only_who_clearly_falls_behind_the_first_look_is_astray():
+    policy = Sometimes()
+    guard = Guard(policy, held_out(1))
+    policy.wrong = 20
+    assert guard.look() == (pytest.approx(float(guard.first.mean())), False)
+    policy.wrong = 21
+    assert not guard.look()[1]
+    policy.wrong = 60
+    assert guard.look()[1]
+    policy.wrong = 0
+    assert guard.look() == (1.0, False)
+    again = Guard(policy, held_out(1))
+    again.load_state_dict(guard.state_dict())
+    policy.wrong = 60
+    assert again.look()[1]
+
+
+def test_nothing_held_out_is_refused():
+    with pytest.raises(UserError, match="no held-out samples"):
+        Guard(Sometimes(), TensorDictReplayBuffer(storage=LazyTensorStorage(4)))
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+def test_practice_for_a_judge_that_leads_astray_is_given_up(guarded, tmp_path):
+    """The judge pays for an action that no demonstration shows."""
+    policy, value = make_networks()
+    torch.nn.init.constant_(policy[0].module.head[-1].bias[2], 1.0)
+    before = {name: weight.clone() for name, weight in policy.state_dict().items()}
+    guard = Guard(policy, held_out(2)) if guarded else None
+    misled = config(
+        iterations=4, lr=3e-2, value_warmup=0, select_every=2, select_episodes=32, max_steps=5
+    )
+    file = tmp_path / "checkpoint.pt"
+    history = self_examine(
+        make_env(likes(1)), policy, value, misled, seed=0, guard=guard, checkpoint=file
+    )
+    looks = [metrics for metrics in history if "selected" in metrics]
+    same = all(torch.equal(weight, before[name]) for name, weight in policy.state_dict().items())
+    assert looks[-1]["selection_return"] > 2
+    assert same == guarded
+    assert looks[-1]["selected"] == (not guarded)
+    if guarded:
+        assert looks[-1]["held_out_agreement"] < 0.5
