@@ -134,6 +134,13 @@ def tiled(rows, height=6, width=6, kinds=9, channels=3):
     return cells.reshape(rows, channels, 8 * height, 8 * width)
 
 
+def test_images_keep_their_contrast_through_the_convolutions_of_a_new_encoder():
+    torch.manual_seed(0)
+    images = torch.randn(64, 3, 48, 48)
+    powers = [ConvEncoder(3, 32, 4)(images).square().mean().item() for _ in range(8)]
+    assert 0.3 < sum(powers) / len(powers) < 1.5  # with PyTorch's own initial weights: 0.0005
+
+
 @pytest.mark.parametrize("layers", [2, 3, 4])
 @pytest.mark.parametrize(("height", "width", "channels"), [(6, 6, 3), (5, 8, 1), (7, 7, 6)])
 @pytest.mark.parametrize("zoom", [1, 3])  # enlarged, what the later layers look at repeats too

@@ -26,6 +26,8 @@ from ifo_grounding.networks.patches import (
 class ConvEncoder(nn.Module):
     """Convolutions of kernel 3, stride 2, padding 1 with ReLU (the paper's experimental settings).
 
+    Weights begin as He et al. (2015) draw them for layers with ReLU: with PyTorch's own, which are
+    smaller, a policy learns colours and stays blind to shapes for a long time.
     Where what a layer looks at repeats, over a batch of images, the layer sees it once.
 
     >>> ConvEncoder(3, features=32, layers=4)(torch.zeros(2, 3, 48, 48)).shape
@@ -42,13 +44,22 @@ class ConvEncoder(nn.Module):
                 for part in (nn.Conv2d(before, after, 3, stride=2, padding=1), nn.ReLU())
             )
         )
+        for layer in self.convolutions:
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+            assert layer.bias is not None
+            nn.init.zeros_(layer.bias)
+
+    @property
+    def convolutions(self) -> list[nn.Conv2d]:
+        """The layers, without what follows each."""
+        return [part for part in self.layers if isinstance(part, nn.Conv2d)]
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w]."""
         windows = distinct_windows(image) if len(self.layers) > 2 else None
         if windows is None:
             return self.layers(as_float(image))
-        first, second, *others = (part for part in self.layers if isinstance(part, nn.Conv2d))
+        first, second, *others = self.convolutions
         features, where = _two_layers(first, second, windows), windows.where
         while others and (found := distinct_blocks(where)):
             blocks, where = found
