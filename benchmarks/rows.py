@@ -317,16 +317,25 @@ def memory() -> Row:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "demonstrations"
         record_demonstrations("pick", 80_000, seed=0).save(path)
-        here = subprocess.run(
-            [sys.executable, __file__, str(path)], stdout=subprocess.PIPE, text=True, check=True
-        )
+        facts = in_new_process("remember", str(path))
     return Row(
         "80,000 demonstrations of pick",
         "MB",
         {},
         note="resident memory that they add, and that imitating them adds (preset strong)",
-        facts=json.loads(here.stdout.splitlines()[-1]),
+        facts=facts,
     )
+
+
+def in_new_process(function: str, *arguments: str) -> dict[str, float]:
+    """Call a function of this file where nothing else has used memory."""
+    ended = subprocess.run(
+        [sys.executable, __file__, function, *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    return json.loads(ended.stdout.splitlines()[-1])
 
 
 def remember(path: str) -> dict[str, float]:
@@ -343,6 +352,34 @@ def remember(path: str) -> dict[str, float]:
         "MB as pixels": round(demos.n_frames * 3 * 48 * 48 / 2**20),
         "MB resident": round(loaded - start),
         "MB added by training": round(peak_memory() - loaded),
+    }
+
+
+def streaming() -> Row:
+    return Row(
+        "100,000 episodes of noise, read one by one",
+        "MB",
+        {},
+        note="four frames of 24x24 pixels each, which do not compress and are kept on disk",
+        facts=in_new_process("stream"),
+    )
+
+
+def stream() -> dict[str, float]:
+    """Read many episodes whose frames do not compress, and say what that takes."""
+    frames = (3, 3, 24, 24)  # their stop is added
+    draw = np.random.default_rng(0)
+    episodes = (
+        (str(number), torch.from_numpy(draw.integers(256, size=frames, dtype=np.uint8)), "go on")
+        for number in range(100_000)
+    )
+    start = resident_memory()
+    demos = Demonstrations.from_episodes(episodes)
+    return {
+        "frames": demos.n_frames,
+        "MB as pixels": round(demos.n_frames * 3 * 24 * 24 / 2**20),
+        "MB resident": round(resident_memory() - start),
+        "MB at most": round(peak_memory() - start),
     }
 
 
@@ -428,9 +465,11 @@ ROWS: dict[str, Callable[[], Row]] = {
     "transitions": random_steps,
     "recording": recording,
     "memory": memory,
+    "streaming": streaming,
     "whole": whole,
     "growth": growth,
 }
 
 if __name__ == "__main__":
-    print(json.dumps(remember(sys.argv[1])))
+    called, *given = sys.argv[1:]
+    print(json.dumps({"remember": remember, "stream": stream}[called](*given)))
