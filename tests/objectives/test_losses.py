@@ -307,6 +307,28 @@ def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
         InstructionLoss(classifier, pool, removal_rate=0.3).calibrate()
 
 
+@pytest.mark.parametrize("preset", ["strong", "grounded"])
+def test_negatives_that_were_not_removed_count_as_the_mixture_that_they_are(preset):
+    torch.manual_seed(0)
+    shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    classifier = make_instruction_classifier(shapes, preset, seed=0)
+    pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
+    loss = InstructionLoss(classifier, pool, removal_rate="estimated")
+    loss.negatives.watch(torch.ones(1000), torch.cat([torch.ones(20), -torch.ones(980)]))
+    image, words = torch.zeros(12, 3, 48, 48, dtype=torch.uint8), pool
+    before = classifier(pixels=image, instruction=words)
+    assert loss.calibrate() == pytest.approx(0.02)
+    after = classifier(pixels=image, instruction=words).sigmoid()
+    torch.testing.assert_close(after, 0.02 * before.exp())
+    # What is 50 times as frequent among positives as in the mixture is surely suitable, and what
+    # is estimated to be even more frequent comes after it.
+    network = classifier.module
+    odds = torch.tensor([0.0, 25.0, 49.0, 50.0, 100.0, 1000.0]).log()
+    sure = network._expected(odds).sigmoid()
+    assert sure[:3].tolist() == pytest.approx([0.0, 0.5, 0.98], abs=1e-4)
+    assert (sure.diff() > 0).all() and sure[-1] < 1
+
+
 def test_few_suitable_pairs_are_not_removed():
     pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
     negatives = NegativeInstructions(pool, "estimated")

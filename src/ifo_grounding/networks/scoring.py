@@ -41,6 +41,8 @@ from ifo_grounding.networks.trunk import (
     same_batch,
 )
 
+SUREST = 0.98
+"""The most that an estimate of densities alone lets one believe."""
 CELLS_AT_ONCE, ROWS_AT_ONCE = 1 << 16, 1 << 12
 """Cells and pairs that are computed together, to bound memory."""
 
@@ -62,12 +64,36 @@ class PairScorer(Network):
     """
 
     prior: Tensor
-    """Added to every logit: the log-odds of suitability before anything is seen, once known."""
+    """Added to every logit: what is known of suitability before anything is seen, see below."""
+    mixed: Tensor
+    """1 where logits were learned against pairs of which some were suitable, else 0."""
 
     def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
         super().__init__(shapes, config)
         self.images = images
         self.register_buffer("prior", torch.zeros(()))
+        self.register_buffer("mixed", torch.zeros(()))
+
+    def expect(self, share: float, mixed: bool) -> None:
+        r"""Make probabilities those of pairs of which a share is suitable.
+
+        A logit z is learned with positives as frequent as negatives. Against unsuitable pairs,
+        Bayes' rule gives :math:`\log\frac{p}{1-p} = z + \log\frac{\pi}{1-\pi}`. Against a
+        mixture that holds the share :math:`\pi` of suitable ones, :math:`e^z` is how much more
+        frequent a pair is among positives than in the mixture, so that :math:`p = \pi e^z`
+        (Elkan and Noto 2008), at most 1. Beyond :data:`SUREST` scores keep their order.
+
+        Args:
+            share: :math:`\pi`.
+            mixed: whether negatives were such a mixture.
+        """
+        self.prior.fill_(math.log(share) if mixed else math.log(share / (1 - share)))
+        self.mixed.fill_(mixed)
+
+    def _expected(self, scores: Tensor) -> Tensor:
+        """Return logits in the light of what :meth:`expect` said."""
+        scores = scores.float() + self.prior
+        return scores - self.mixed * torch.log1p(-scores.clamp(max=math.log(SUREST)).exp())
 
     def encode_pixels(self, *pixels: Tensor) -> Tensor:
         """Map images, each [*B, C, H, W], to features [*B, F, h, w] that know no instruction."""
@@ -204,7 +230,7 @@ class SentenceScorer(PairScorer):
                 self.head(self._read(outlook, pairs.index[some], groups[some]))
                 for some in slices(len(which), ROWS_AT_ONCE)
             ]
-        return torch.cat(outputs).float().reshape(rows, count) + self.prior
+        return self._expected(torch.cat(outputs).reshape(rows, count))
 
     def _outlook(self, fused: Tensor) -> list[Tensor]:
         """Return all that is read of each cell, [Q, ...] each, of features [Q, F, 1, 1]."""
@@ -228,7 +254,7 @@ class SentenceScorer(PairScorer):
             for fuse in self.fusion:
                 fused = fuse(fused, words)
             outputs = self.head(self._summary(F.relu(fused)))
-        return outputs.float().reshape(*batch, 1) + self.prior
+        return self._expected(outputs.reshape(*batch, 1))
 
     def _summary(self, fused: Tensor) -> Tensor:
         if not self.strong:

@@ -153,7 +153,7 @@ class WordScorer(PairScorer):
                 self.head(self._read(scenes[some], words, index[some])).squeeze(-1)
                 for some in slices(len(index), rows)
             ]
-        return torch.cat(parts).float() + self.prior
+        return self._expected(torch.cat(parts))
 
     def _read(self, scenes: Kinds, words: Tensor, index: Tensor) -> Tensor:
         """Read N scenes in the light of some instructions [N, K]: [N, K, size]."""

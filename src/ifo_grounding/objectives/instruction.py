@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,7 +118,8 @@ class InstructionLoss(SupervisedLoss):
         In training positives and negatives weigh the same, so that a probability is that of a pair
         which is suitable as likely as not. Afterwards it is that of a random pair of a fresh scene
         and the pool, and a threshold means the same for pools in which one of three instructions
-        suits and for those in which one of three hundred does.
+        suits and for those in which one of three hundred does. Where so few suit that none were
+        removed, the negatives are taken for what they are, a mixture that holds suitable pairs.
 
         Raises:
             UserError: where the share is unknown, for the removal rate was given.
@@ -128,8 +128,8 @@ class InstructionLoss(SupervisedLoss):
         if estimate is None:
             raise UserError("calibrate needs removal_rate='estimated'")
         share = min(max(estimate.share(), LEAST_SHARE), MOST_REMOVED)
-        prior = self.network.get_buffer("module.prior")
-        prior.fill_(math.log(share / (1 - share)))
+        mixed = self.unlabelled == "removal" and not self.negatives.share
+        self.network.module.expect(share, mixed)
         return share
 
     def _extra_keys(self) -> list[NestedKey]:
