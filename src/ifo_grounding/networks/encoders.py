@@ -26,8 +26,8 @@ from ifo_grounding.networks.patches import (
 class ConvEncoder(nn.Module):
     """Convolutions of kernel 3, stride 2, padding 1 with ReLU (the paper's experimental settings).
 
-    Weights begin as He et al. (2015) draw them for layers with ReLU: with PyTorch's own, which are
-    smaller, a policy learns colours and stays blind to shapes for a long time.
+    Weights begin as :func:`begin_before_relu` draws them: with PyTorch's own, which are smaller, a
+    policy learns colours and stays blind to shapes for a long time.
     Where what a layer looks at repeats, over a batch of images, the layer sees it once.
 
     >>> ConvEncoder(3, features=32, layers=4)(torch.zeros(2, 3, 48, 48)).shape
@@ -74,6 +74,13 @@ class ConvEncoder(nn.Module):
         for _ in range(layers):
             height, width = (height + 1) // 2, (width + 1) // 2
         return height, width
+
+
+def begin_before_relu(layer: nn.Conv2d | nn.Linear) -> None:
+    """Draw the initial weights of a layer that a ReLU follows (He et al. 2015), and no bias."""
+    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
 
 
 def _two_layers(first: nn.Conv2d, second: nn.Conv2d, windows: Windows) -> Tensor:

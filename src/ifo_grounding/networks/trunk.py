@@ -20,6 +20,7 @@ from ifo_grounding.networks.encoders import (
     GRUInstructionEncoder,
     InstructionEncoder,
     PatchEncoder,
+    begin_before_relu,
 )
 from ifo_grounding.networks.fusion import (
     GatedAttention,
@@ -149,10 +150,16 @@ def flatten_cells(features: Tensor) -> Tensor:
 
 
 def head(size: int, config: NetworkConfig, outputs: int) -> nn.Sequential:
-    """Return several linear layers with ReLU between them and dropout before each."""
+    """Return several linear layers with ReLU between them and dropout before each.
+
+    With ``paper`` they begin as its convolutions do.
+    """
     layers: list[nn.Module] = []
     for hidden in config.head_hidden:
-        layers += [nn.Dropout(config.dropout), nn.Linear(size, hidden), nn.ReLU()]
+        layer = nn.Linear(size, hidden)
+        if config.preset == "paper":
+            begin_before_relu(layer)
+        layers += [nn.Dropout(config.dropout), layer, nn.ReLU()]
         size = hidden
     return nn.Sequential(*layers, nn.Dropout(config.dropout), nn.Linear(size, outputs))
 

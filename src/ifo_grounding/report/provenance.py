@@ -34,11 +34,12 @@ def provenance() -> dict[str, Any]:
 
 
 def _commit() -> str | None:
+    """Return the commit, with a plus where files other than results changed since."""
     root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists():
         return None
     commit = _git(root, "rev-parse", "--short=12", "HEAD")
-    changed = _git(root, "status", "--porcelain", "--untracked-files=no")
+    changed = _git(root, "status", "--porcelain", "--untracked-files=no", ":!results")
     return f"{commit}+" if commit and changed else commit
 
 
