@@ -26,9 +26,9 @@ from ifo_grounding.networks.patches import (
 class ConvEncoder(nn.Module):
     """Convolutions of kernel 3, stride 2, padding 1 with ReLU (the paper's experimental settings).
 
-    Weights begin as :func:`begin_before_relu` draws them: with PyTorch's own, which are smaller, a
-    policy learns colours and stays blind to shapes for a long time.
-    Where what a layer looks at repeats, over a batch of images, the layer sees it once.
+    Weights begin as :func:`begin_before_relu` draws them: PyTorch's own, which are smaller, would
+    leave a fiftieth of an image's contrast after four layers. Where what a layer looks at repeats,
+    over a batch of images, the layer sees it once.
 
     >>> ConvEncoder(3, features=32, layers=4)(torch.zeros(2, 3, 48, 48)).shape
     torch.Size([2, 32, 3, 3])
