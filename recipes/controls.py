@@ -15,14 +15,14 @@ from _shared import (
 )
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig, OmegaConf
-from self_examine import guard, needs, practice
+from self_examine import needs, practice
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.training import FitConfig, Rehearsal, Selection, Stage, accepted_steps
+from ifo_grounding.training import FitConfig, Guard, Rehearsal, Selection, Stage, accepted_steps
 
 SECTIONS = ["imitate", "self_examine", "instruction", "controls"]
 
@@ -70,17 +70,17 @@ def imitate_on(
     policy = load_network(stage.run, POLICIES[0], "imitate", options)
     env, _, _ = practice(stage.run, options)
     settings: dict[str, Any] = {"steps": matched_steps(options), "lr": options.controls.lr}
+    buffer, aside = labelled_demonstrations(stage.run, options.imitate.held_out)
     selection = None
     if section.select_every:
         # Before any rollout, so that it remembers the first starts.
         chosen = self_examination_config(section)
-        seen = guard(policy, stage.run, options)
-        selection = Selection(env, policy, chosen.selection, options.seed, seen)
+        guard = Guard(policy, aside) if aside is not None else None
+        selection = Selection(env, policy, chosen.selection, options.seed, guard)
         selection.look()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)
         iteration = options.imitate.get("iteration", FitConfig.iteration)
         settings["validate_every"] = math.ceil(settings["steps"] / iteration / looks)
-    buffer, _ = labelled_demonstrations(stage.run, options.imitate.held_out)
     found = {}
     if rollouts is not None:
         accepted = rollouts(env)

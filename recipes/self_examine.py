@@ -19,7 +19,6 @@ from _shared import (
 from _worlds import build, open_world
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig
-from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import networks
@@ -40,6 +39,9 @@ def examine(options: DictConfig) -> dict:
     policy = load_network(run, POLICIES[0], "imitate", options)
     value = build(networks.make_value, options, init_from=policy)
     env, reward, adversary = practice(run, options)
+    seen, aside = labelled_demonstrations(run, options.imitate.held_out)
+    weight = section.rehearsal
+    rehearsed = Rehearsal(ImitationLoss(policy), seen, weight) if weight else None
     history = self_examine(
         env,
         policy,
@@ -47,8 +49,8 @@ def examine(options: DictConfig) -> dict:
         self_examination_config(section),
         seed=options.seed,
         adversary=adversary,
-        rehearsal=rehearsal(policy, run, options),
-        guard=guard(policy, run, options),
+        rehearsal=rehearsed,
+        guard=Guard(policy, aside) if aside is not None else None,
         checkpoint=stage.checkpoint,
         log=stage.log(),
         callback=audit_callback(policy, reward, run, options),
@@ -65,21 +67,6 @@ def needs(options: DictConfig) -> list[str]:
         options.self_examine.kind, ["train_reward", "train_goal"]
     )
     return ["imitate", "train_instruction", *judges]
-
-
-def rehearsal(policy: nn.Module, run: Run, options: DictConfig) -> Rehearsal | None:
-    """Return what imitates the demonstrations on, where that is wanted."""
-    weight = options.self_examine.rehearsal
-    if not weight:
-        return None
-    seen, _ = labelled_demonstrations(run, options.imitate.held_out)
-    return Rehearsal(ImitationLoss(policy), seen, weight)
-
-
-def guard(policy: Any, run: Run, options: DictConfig) -> Guard | None:
-    """Return what asks the demonstrations that were held out from phase 1, if some were."""
-    _, aside = labelled_demonstrations(run, options.imitate.held_out)
-    return None if aside is None else Guard(policy, aside)
 
 
 def practice(

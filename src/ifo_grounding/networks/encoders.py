@@ -45,9 +45,7 @@ class ConvEncoder(nn.Module):
             )
         )
         for layer in self.convolutions:
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-            assert layer.bias is not None
-            nn.init.zeros_(layer.bias)
+            begin_before_relu(layer)
 
     @property
     def convolutions(self) -> list[nn.Conv2d]:
