@@ -1,7 +1,7 @@
 """Draw the pictures of the README: ``python docs/make_assets.py RUN`` after a demo run.
 
 ``world.png`` shows a scene of each task; ``agent.gif`` a policy of that run (a name or a path). One
-of the preset `grounded` gives ``evidence.png`` instead: what its words say about things.
+that was trained with ``world.split=train`` gives ``evidence.png`` instead: what its words say.
 """
 
 import sys
@@ -43,8 +43,7 @@ def agent(run: Run) -> bytes:
 
 def evidence(run: Run, options: dict[str, Any]) -> bytes:
     policy = networks.load(run.need("policy-phase1.safetensors", "two_phase"))
-    held_out = HOLDOUTS[options["world"]["holdout"]] if options["world"]["split"] == "train" else ()
-    return figure_png(evidence_figure(word_evidence(policy), held_out))
+    return figure_png(evidence_figure(word_evidence(policy), HOLDOUTS[options["world"]["holdout"]]))
 
 
 def main() -> None:
@@ -52,7 +51,7 @@ def main() -> None:
         raise SystemExit("usage: python docs/make_assets.py RUN")
     run = Run(sys.argv[1])
     options = read_json(run.need("options.json", "two_phase"))
-    if options["network"] == "grounded":
+    if options["world"]["split"] == "train":
         pictures = {"evidence.png": evidence(run, options)}
     else:
         pictures = {"world.png": world(), "agent.gif": agent(run)}

@@ -27,7 +27,7 @@ from ifo_grounding.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "assets" / "studies.png"
-HACKED = ROOT / "results" / "study" / "move-200-strong-action-centred-seed0.json"
+HACKED = ROOT / "results" / "study" / "move-200-film-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
     "continued": "imitation continued",

@@ -1,6 +1,6 @@
-"""Zero-shot, one part at a time: what the preset `grounded` owes to each of its parts.
+"""Zero-shot, one part at a time: what the preset `strong` owes to each of its parts.
 
-And what common remedies do for `strong`, which hears a sentence as one vector.
+And what common remedies do for `film`, which hears a sentence as one vector.
 
 python recipes/zero_shot.py task=move seed=0
 """
@@ -106,7 +106,7 @@ class JitteredLoss(ImitationLoss):
 
 @dataclass(frozen=True)
 class Sentence:
-    """What is changed of the preset `strong`, or of how it learns."""
+    """What is changed of the preset `film`, or of how it learns."""
 
     network: dict[str, Any] = field(default_factory=dict)
     imitate: dict[str, Any] = field(default_factory=dict)
@@ -123,7 +123,7 @@ SENTENCES = {
 }
 WHOLE = "whole"
 VARIANTS = (WHOLE, *CHANGES, *SENTENCES)
-"""The whole preset, what is changed in one part alone, and the preset `strong` with remedies."""
+"""The whole preset, what is changed in one part alone, and the preset `film` with remedies."""
 
 
 def compare(options: DictConfig) -> dict[str, dict]:
@@ -157,9 +157,9 @@ def beginning(name: str, options: DictConfig, seed: int) -> ImitationLoss:
     world = open_world(options).simulator()
     if name in SENTENCES:
         what = SENTENCES[name]
-        policy = make_policy(world, "strong", seed=seed, device=options.device, **what.network)
+        policy = make_policy(world, "film", seed=seed, device=options.device, **what.network)
         return what.loss(policy)
-    loss = ImitationLoss(make_policy(world, "grounded", seed=seed, device=options.device))
+    loss = ImitationLoss(make_policy(world, "strong", seed=seed, device=options.device))
     if name in CHANGES:
         trunk = trunk_of(loss.network)
         assert isinstance(trunk, GroundedTrunk)

@@ -140,7 +140,7 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
         "75.0% [",
         "<br>+25.0 [",
         "| **pick** | the paper | 90.2% |",
-        "|  | `paper` | not run | not run | not run |\n|  | `strong` | 75.0% [",
+        "|  | `film` | not run | not run | not run |\n|  | `strong` | 75.0% [",
         "| pick | `strong` | 15 | 0 | 0 | 5 | 0 | 0 |",
         "| phase 2 alone | pick | `strong` | 2 | 0 | 0 | 0 |",
         "| pick | `strong` | 1 | 3 |",

@@ -15,22 +15,22 @@ def policy(preset):
 
 
 def test_only_edges_show_the_shape_of_new_pairs():
-    apart = probe(policy("grounded"), "move", scenes=200)
+    apart = probe(policy("strong"), "move", scenes=200)
     assert apart.seeing_shape.held_out > 0.99 and apart.seeing_colour.held_out > 0.8
     assert apart.reading_colour is None and apart.reading_shape is None
-    whole = probe(policy("strong"), "move", scenes=200)
+    whole = probe(policy("film"), "move", scenes=200)
     assert whole.seeing_shape.trained > 0.8 and whole.seeing_shape.held_out < 0.2
 
 
 def test_sentences_are_read_by_a_probe_that_knows_trained_pairs_alone():
-    found = probe(policy("strong"), "move", scenes=200)
+    found = probe(policy("film"), "move", scenes=200)
     assert found.reading_colour.trained == found.reading_shape.trained == 1
-    again = probe(policy("strong"), "move", scenes=200)
+    again = probe(policy("film"), "move", scenes=200)
     assert found == again
 
 
 def test_a_map_that_prefers_no_cell_lays_the_same_weight_on_each():
-    network = policy("grounded")
+    network = policy("strong")
     words = trunk_of(network).words
     with torch.no_grad():
         words.about_colour.weight.zero_()

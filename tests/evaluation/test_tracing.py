@@ -22,7 +22,7 @@ def env():
     return PickAndPlaceEnv("pick", num_envs=1)
 
 
-@pytest.mark.parametrize(("preset", "maps"), [("strong", 8), ("grounded", 16), ("paper", 1)])
+@pytest.mark.parametrize(("preset", "maps"), [("film", 8), ("strong", 16), ("paper", 1)])
 def test_steps_are_as_the_policy_took_them(env, preset, maps):
     policy = make_policy(env, preset, seed=0)
     (episode,) = record_episodes(policy, "pick", [2], max_steps=7)
@@ -64,7 +64,7 @@ def test_judges_say_what_the_learned_reward_pays(env):
 
 
 def test_every_step_is_a_picture(env):
-    policy = make_policy(env, "grounded", seed=0)
+    policy = make_policy(env, "strong", seed=0)
     (episode,) = record_episodes(policy, "pick", [2], max_steps=7)
     trace = trace_episode(policy, episode)
     for shown in (2, 30):

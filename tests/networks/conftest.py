@@ -35,7 +35,7 @@ def kind(request):
     return request.param
 
 
-@pytest.fixture(params=["strong", "grounded", "paper"])
+@pytest.fixture(params=["film", "strong", "paper"])
 def preset(request):
     return request.param
 

@@ -40,7 +40,7 @@ def outputs_and_gradients(network, *inputs) -> tuple[Tensor, dict[str, Tensor]]:
 @pytest.mark.parametrize("make", [make_policy, make_value, make_instruction_classifier])
 def test_outputs_and_gradients_are_those_of_a_plain_pass(make, scenes, monkeypatch):
     pixels, tokens, shapes = scenes
-    module = make(shapes, seed=0)
+    module = make(shapes, "film", seed=0)
     network = module.module[0].module if make is make_policy else module.module
     assert network_looks_up_cells(network, pixels)
     quick, gradients = outputs_and_gradients(network, pixels, tokens)
@@ -75,7 +75,7 @@ def test_the_inverse_module_looks_up_what_changed(scenes, monkeypatch):
 
 def test_two_images_at_once(scenes, monkeypatch):
     pixels, tokens, shapes = scenes
-    judge = make_goal_judge(shapes, seed=0).module
+    judge = make_goal_judge(shapes, "film", seed=0).module
     quick, _ = outputs_and_gradients(judge, pixels, pixels.flip(0), tokens)
     plainly(monkeypatch)
     plain, _ = outputs_and_gradients(judge, pixels, pixels.flip(0), tokens)
@@ -85,7 +85,7 @@ def test_two_images_at_once(scenes, monkeypatch):
 @pytest.mark.parametrize("make", [make_instruction_classifier, make_goal_judge])
 def test_scenes_are_read_by_kinds_of_cells_as_cell_by_cell(make, scenes):
     pixels, tokens, shapes = scenes
-    network = make(shapes, "grounded", seed=0).module
+    network = make(shapes, "strong", seed=0).module
     images = (pixels, pixels.flip(0))[: network.images]
     index = torch.randint(len(tokens), (len(pixels), 5), generator=torch.Generator().manual_seed(0))
 
@@ -111,7 +111,7 @@ def test_scenes_are_read_by_kinds_of_cells_as_cell_by_cell(make, scenes):
 def test_candidates_are_scored_like_pairs(scenes, monkeypatch, room):
     monkeypatch.setattr(cells_module, "ROOM", room)
     pixels, tokens, shapes = scenes
-    classifier = make_instruction_classifier(shapes, seed=0).module
+    classifier = make_instruction_classifier(shapes, "film", seed=0).module
     index = torch.randint(len(tokens), (len(pixels), 5), generator=torch.Generator().manual_seed(0))
     words = classifier.encode_instruction(tokens)
     found = classifier.encode_scenes(pixels)

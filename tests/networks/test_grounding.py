@@ -44,7 +44,7 @@ def test_colour_and_form_are_seen_apart():
 
 
 def test_each_word_adds_evidence_of_its_own(shapes):
-    trunk = trunk_of(make_policy(shapes, "grounded", seed=0))
+    trunk = trunk_of(make_policy(shapes, "strong", seed=0))
     assert isinstance(trunk, GroundedTrunk)
     words = trunk.words
     with torch.no_grad():
@@ -57,7 +57,7 @@ def test_each_word_adds_evidence_of_its_own(shapes):
 
 
 def test_roles_do_not_hear_every_word_in_training(shapes):
-    words = trunk_of(make_policy(shapes, "grounded", seed=0)).words
+    words = trunk_of(make_policy(shapes, "strong", seed=0)).words
     tokens = VOCABULARY.encode(["move to the red circle", "move to the blue diamond"])
     heard = [part.clone() for part in words.roles(tokens)]
     again = words.roles(tokens)
@@ -87,7 +87,7 @@ def test_words_are_swapped_between_instructions_of_a_length():
 
 
 def test_what_words_say_is_charged_for_in_training(shapes):
-    policy = make_policy(shapes, "grounded", seed=0)
+    policy = make_policy(shapes, "strong", seed=0)
     batch = TensorDict(
         {
             "pixels": tiles("red circle", "blue triangle"),
@@ -106,11 +106,11 @@ def test_what_words_say_is_charged_for_in_training(shapes):
     )
     assert take_charge(policy) is None  # taken, so that the policy can be copied
     assert "loss_words" not in loss.eval()(batch)
-    assert "loss_words" not in ImitationLoss(make_policy(shapes, seed=0))(batch)
+    assert "loss_words" not in ImitationLoss(make_policy(shapes, "film", seed=0))(batch)
 
 
 def test_words_outside_the_vocabulary_are_named(shapes):
-    policy = make_policy(shapes, "grounded", seed=0)
+    policy = make_policy(shapes, "strong", seed=0)
     with pytest.raises(UserError, match="token ids from 1 to 99"):
         policy(pixels=tiles("red circle"), instruction=torch.tensor([[1, 99]]))
 
@@ -123,7 +123,7 @@ def test_pairs_that_no_demonstration_names_are_followed():
     config = FitConfig(steps=800, batch_size=256, lr=4e-3, weight_decay=0.01)
 
     def begin(seed):
-        loss = ImitationLoss(make_policy(demos, "grounded", seed=seed))
+        loss = ImitationLoss(make_policy(demos, "strong", seed=seed))
         return loss, fit(loss, buffer, config, seed=0, until=300)[-1]["loss_imitation"]
 
     loss, _ = min((begin(seed) for seed in range(6)), key=lambda tried: tried[1])
@@ -134,7 +134,7 @@ def test_pairs_that_no_demonstration_names_are_followed():
 
 
 def test_padding_says_nothing(shapes):
-    policy = make_policy(shapes, "grounded", seed=0).eval()
+    policy = make_policy(shapes, "strong", seed=0).eval()
     tokens = VOCABULARY.encode(["move to the red circle", "put the blue diamond in the green box"])
     image = tiles("red circle", "blue triangle").expand(2, -1, -1, -1)
 

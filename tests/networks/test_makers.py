@@ -118,7 +118,7 @@ def test_wrong_images_batches_and_options_are_named(kind, shapes):
     small = inputs(Shapes((3, 40, 48), 40), [2])
     with pytest.raises(UserError, match=r"built for images of \(3, 48, 48\), got \(3, 40, 48\)"):
         run(kind, module, small)
-    with pytest.raises(UserError, match="unknown preset 'weak': choose one of 'paper', 'strong'"):
+    with pytest.raises(UserError, match="unknown preset 'weak': choose one of 'paper', 'film'"):
         MAKERS[kind](shapes, "weak")
     with pytest.raises(UserError, match="unknown option of a network 'depth'"):
         MAKERS[kind](shapes, depth=3)
@@ -145,8 +145,10 @@ def test_presets_are_what_the_design_says():
     paper = NetworkConfig.of("policy", "paper")
     assert (paper.conv_layers, paper.features, paper.hidden, paper.embedding) == (4, 32, 64, 8)
     assert paper.dropout == 0.25
-    strong = NetworkConfig.of("policy", "strong")
-    assert (strong.n_blocks, strong.features, strong.heads) == (2, 64, 8)
+    film = NetworkConfig.of("policy", "film")
+    assert (film.n_blocks, film.features, film.heads, film.matching) == (2, 64, 8, "sentence")
+    strong = NetworkConfig.of("policy")
+    assert (strong.preset, strong.matching, strong.maps) == ("strong", "words", 8)
 
 
 def test_bf16_stays_near_fp32(kind, preset, shapes):

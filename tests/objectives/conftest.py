@@ -29,7 +29,7 @@ LOSSES = {
 }
 
 
-@pytest.fixture(params=["strong", "paper"])
+@pytest.fixture(params=["film", "paper"])
 def preset(request):
     return request.param
 
@@ -39,7 +39,7 @@ def kind(request):
     return request.param
 
 
-def make_loss(kind: str, preset: str = "strong", make_options=None, **options):
+def make_loss(kind: str, preset: str = "film", make_options=None, **options):
     make, loss, defaults = LOSSES[kind]
     network = make(SHAPES, preset, seed=0, **(make_options or {}))
     return loss(network, **{**defaults, **options})

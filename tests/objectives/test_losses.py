@@ -189,7 +189,7 @@ def test_a_risk_below_zero_is_turned_round():
 
 
 def test_halves_and_whole_networks_give_the_same_loss():
-    loss = make_loss("instruction", "strong", removal_rate=0.3)
+    loss = make_loss("instruction", "film", removal_rate=0.3)
     whole = TensorDictModule(
         loss.network.module.forward, in_keys=["pixels", "instruction"], out_keys=["suitability"]
     )
@@ -294,7 +294,7 @@ def test_a_batch_without_one_class_still_has_a_finite_loss(final):
 def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
     torch.manual_seed(0)
     shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
-    classifier = make_instruction_classifier(shapes, seed=0, features=16)
+    classifier = make_instruction_classifier(shapes, "film", seed=0, features=16)
     pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
     loss = InstructionLoss(classifier, pool, removal_rate="estimated")
     image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), pool[:2]
@@ -307,7 +307,7 @@ def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
         InstructionLoss(classifier, pool, removal_rate=0.3).calibrate()
 
 
-@pytest.mark.parametrize("preset", ["strong", "grounded"])
+@pytest.mark.parametrize("preset", ["film", "strong"])
 def test_negatives_that_were_not_removed_count_as_the_mixture_that_they_are(preset):
     torch.manual_seed(0)
     shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)

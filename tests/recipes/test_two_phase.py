@@ -14,14 +14,14 @@ PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
 @pytest.mark.parametrize(
     ("task", "preset", "extra"),
     [
-        ("move", "strong", []),
+        ("move", "film", []),
         ("pick-udlr", "paper", ["self_examine.pairs=24"]),
         (
             "move-udlr",
-            "grounded",
+            "strong",
             ["world.split=train", "evaluate.split=zero-shot", "self_examine.recombine=true"],
         ),
-        ("pick-out", "strong", ["self_examine.kind=both", "self_examine.reward_steps=1"]),
+        ("pick-out", "film", ["self_examine.kind=both", "self_examine.reward_steps=1"]),
     ],
 )
 def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, preset, extra):
@@ -131,7 +131,7 @@ def test_every_recipe_has_options_that_begin_with_its_command(recipes):
         assert Path(script).read_text().startswith('"""')
 
 
-@pytest.mark.parametrize(("preset", "schedule"), [("paper", "constant"), ("strong", "cosine")])
+@pytest.mark.parametrize(("preset", "schedule"), [("paper", "constant"), ("film", "cosine")])
 def test_the_papers_learning_rate_does_not_decay(compose, preset, schedule):
     from _shared import fit_config
 

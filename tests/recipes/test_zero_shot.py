@@ -1,4 +1,4 @@
-"""Variants of the preset `grounded`, each trained on the same labels."""
+"""Variants of the preset `strong`, each trained on the same labels."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def test_variants_leave_a_file_each_and_are_made_once(options, tmp_path):
     from zero_shot import compare
 
     found = compare(options("variants=[whole,cells-whole]"))
-    file = tmp_path / "move-60-grounded-cells-whole-seed0.json"
+    file = tmp_path / "move-60-strong-cells-whole-seed0.json"
     assert read_json(file)["results"] == found["cells-whole"]
     assert sum(found["whole"]["held-out"]["counts"].values()) == 30
     trained = set(found["whole"]["trained"]["by_object"])
@@ -88,7 +88,7 @@ def test_remedies_of_the_sentence_network_change_it_or_how_it_learns(options, tm
     assert sizes["sentence-narrow"] < sizes["sentence"] == sizes["sentence-dropout"]
     assert dropouts["sentence-dropout"] == {0.5} != dropouts["sentence"]
     compare(options("variants=[sentence-decay]"))
-    kept = read_json(tmp_path / "move-60-grounded-sentence-decay-seed0.json")
+    kept = read_json(tmp_path / "move-60-strong-sentence-decay-seed0.json")
     assert kept["results"]["trained"]["rate"]["count"] == 30
 
 

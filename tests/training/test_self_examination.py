@@ -21,7 +21,7 @@ from ifo_grounding.training import (
 from ifo_grounding.training.environment import summary
 from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
 
-SMALL = {"n_blocks": 1, "features": 16, "seed": 0}
+SMALL = {"preset": "film", "n_blocks": 1, "features": 16, "seed": 0}
 POOL = grammar("move").tokens
 
 

@@ -30,7 +30,9 @@ def buffer():
 
 
 def imitation(dropout=0.0):
-    return ImitationLoss(make_policy(SHAPES, seed=0, n_blocks=1, features=16, dropout=dropout))
+    return ImitationLoss(
+        make_policy(SHAPES, "film", seed=0, n_blocks=1, features=16, dropout=dropout)
+    )
 
 
 def test_fit_learns_and_reports_each_iteration(buffer):

@@ -102,7 +102,7 @@ def probe(
 
     >>> from ifo_grounding.networks import make_policy
     >>> env = PickAndPlaceEnv("move", num_envs=1)
-    >>> found = probe(make_policy(env, "grounded", seed=0), "move", scenes=40)
+    >>> found = probe(make_policy(env, "strong", seed=0), "move", scenes=40)
     >>> found.reading_colour is None, 0 <= found.matching.held_out <= 1
     (True, True)
     """

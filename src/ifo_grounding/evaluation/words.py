@@ -33,10 +33,10 @@ class WordEvidence:
 def word_evidence(
     policy: nn.Module, words: Sequence[str] = (*COLOURS, *SHAPES), tile_size: int = 8
 ) -> WordEvidence:
-    """Ask a policy of the preset ``grounded`` what its words say about each kind of object.
+    """Ask a policy of the preset ``strong`` what its words say about each kind of object.
 
     Args:
-        policy: built by ``make_policy(..., "grounded")``, with the vocabulary of this world.
+        policy: built by ``make_policy(..., "strong")``, with the vocabulary of this world.
         words: of the vocabulary.
         tile_size: pixels along one side of a cell.
 
@@ -45,13 +45,13 @@ def word_evidence(
 
     >>> from ifo_grounding.networks import Shapes, make_policy
     >>> sizes = Shapes((3, 48, 48), len(VOCABULARY), tile_size=8)
-    >>> said = word_evidence(make_policy(sizes, "grounded", seed=0))
+    >>> said = word_evidence(make_policy(sizes, "strong", seed=0))
     >>> said.words[0], said.objects[0], said.colour.shape
     ('red', 'red circle', torch.Size([12, 7]))
     """
     trunk = trunk_of(policy)
     if not isinstance(trunk, GroundedTrunk):
-        raise UserError("this policy does not read word by word: build it with preset 'grounded'")
+        raise UserError("this policy does not read word by word: build it with preset 'strong'")
     state = WorldState.empty(1)
     state.objects[0, :N_KINDS] = torch.arange(1, N_KINDS + 1, dtype=torch.uint8)
     state.arm[0] = N_KINDS

@@ -11,8 +11,8 @@ from ifo_grounding.networks.trunk import grid
 def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Tensor:
     """Return how each map of a policy weighs the cells of images, in the light of instructions.
 
-    The maps are the heads of the preset ``strong``, the word maps of ``grounded``, each read both
-    ways, and of ``paper`` what all gates together let through.
+    The maps are the word maps of the preset ``strong``, each read both ways, the heads of ``film``,
+    and of ``paper`` what all gates together let through.
 
     Args:
         policy: built by ``make_policy``.

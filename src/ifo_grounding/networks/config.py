@@ -1,4 +1,4 @@
-"""Every size and choice of a network, in one dataclass, with the values of the two presets."""
+"""Every size and choice of a network, in one dataclass, with the values of the presets."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ class NetworkConfig:
     """
 
     preset: str
-    """``"paper"`` (strided convolutions, gated attention), ``"strong"`` (patches, FiLM), or
-    ``"grounded"``: as strong, but policy, critic, instruction module and goal judge read word by
+    """``"paper"`` (strided convolutions, gated attention), ``"film"`` (patches, FiLM), or
+    ``"strong"``: as film, but policy, critic, instruction module and goal judge read word by
     word."""
     features: int
     """Channels of the feature map."""
     conv_layers: int
     """Strided convolutions (``paper``)."""
     patch_size: int | None
-    """Pixels per side of a patch (``strong``); None means the tile size, or 8."""
+    """Pixels per side of a patch (``film``, ``strong``); None means the tile size, or 8."""
     n_blocks: int
-    """Residual blocks that modulate the feature map by the instruction (``strong``)."""
+    """Residual blocks that modulate the feature map by the instruction (``film``, ``strong``)."""
     kernel: int
-    """Cells across that a residual block sees: 1 for the cell alone (``strong``)."""
+    """Cells across that a residual block sees: 1 for the cell alone (``film``, ``strong``)."""
     context: int
-    """Residual blocks of kernel 3 before the instruction comes in (``strong``)."""
+    """Residual blocks of kernel 3 before the instruction comes in (``film``, ``strong``)."""
     heads: int
-    """Attention maps that the head reads (``strong``)."""
+    """Attention maps that the head reads (``film``, ``strong``)."""
     values: int
-    """Values that each attention map reads (``strong``)."""
+    """Values that each attention map reads (``film``, ``strong``)."""
     detectors: int
-    """Kinds of cells that the instruction module and the goal judge count (``strong``)."""
+    """Kinds of cells that the instruction module and the goal judge count (``film``)."""
     matching: str
     """How an instruction meets cells: ``"sentence"``, as one vector, or ``"words"``, each by
     itself (:class:`~ifo_grounding.networks.WordMaps`)."""
@@ -107,7 +107,7 @@ _PAPER: dict[str, Any] = {
     "dropout": 0.25,
     "head_hidden": (128, 64),
 }
-_STRONG: dict[str, Any] = {
+_FILM: dict[str, Any] = {
     "features": 64,
     "conv_layers": 0,
     "patch_size": None,
@@ -125,21 +125,21 @@ _STRONG: dict[str, Any] = {
     "dropout": 0.0,
     "head_hidden": (128,),
 }
-_INVERSE: dict[str, Any] = {**_STRONG, "features": 32, "n_blocks": 0, "context": 2}
-_GROUNDED: dict[str, Any] = {**_STRONG, "matching": "words", "maps": 8}
+_INVERSE: dict[str, Any] = {**_FILM, "features": 32, "n_blocks": 0, "context": 2}
+_WORDS: dict[str, Any] = {**_FILM, "matching": "words", "maps": 8}
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "paper": {**dict.fromkeys(KINDS, _PAPER), "value": {**_PAPER, "dropout": 0.0}},
-    "strong": {
-        **dict.fromkeys(KINDS, _STRONG),
+    "film": {
+        **dict.fromkeys(KINDS, _FILM),
         "inverse": _INVERSE,
     },
-    "grounded": {
-        **dict.fromkeys(KINDS, _STRONG),
+    "strong": {
+        **dict.fromkeys(KINDS, _FILM),
         "inverse": _INVERSE,
-        "policy": _GROUNDED,
-        "value": _GROUNDED,
-        "instruction": _GROUNDED,
-        "goal": _GROUNDED,
+        "policy": _WORDS,
+        "value": _WORDS,
+        "instruction": _WORDS,
+        "goal": _WORDS,
     },
 }
 """Values by preset and kind. A critic has no dropout: its targets would be noise."""

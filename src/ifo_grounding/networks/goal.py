@@ -35,7 +35,7 @@ def make_goal_judge(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"grounded"`` or ``"paper"``.
+        preset: ``"strong"``, ``"film"`` or ``"paper"``.
         in_keys: the episode's first image and the present one, uint8 [*B, C, H, W], and the
             instruction, int64 [*B, L].
         out_key: where the logit goes.

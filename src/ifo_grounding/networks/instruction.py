@@ -42,7 +42,7 @@ def begin_with_policy(network: PairScorer, policy: nn.Module, plan: Blueprint) -
     trunk = trunk_of(policy)
     if isinstance(trunk, GroundedTrunk) != isinstance(network, WordScorer):
         raise UserError(
-            "one of init_from and this network reads word by word (preset 'grounded'), the other "
+            "one of init_from and this network reads word by word (preset 'strong'), the other "
             "reads sentences: give both the same preset, or begin without init_from"
         )
     if isinstance(trunk, GroundedTrunk):
@@ -86,7 +86,7 @@ def make_instruction_classifier(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"grounded"`` or ``"paper"``.
+        preset: ``"strong"``, ``"film"`` or ``"paper"``.
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         out_key: where the logit goes; the paper's threshold of 0.8 is on its sigmoid.
         init_from: a policy of the same preset and sizes whose weights it begins with. It has

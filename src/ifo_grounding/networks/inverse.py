@@ -31,18 +31,18 @@ from ifo_grounding.networks.trunk import (
 class InverseNetwork(Network):
     """inv(s, s') -> logits of the actions.
 
-    ``strong`` also sees how far each pixel changed, which makes a stop plain, and pools over cells,
-    for what changes tells the action wherever it happens. ``paper`` sees the two images alone.
+    ``paper`` sees the two images alone. Other presets also see how far each pixel changed, which
+    makes a stop plain, and pool over cells: what changes tells the action wherever it happens.
     """
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__(shapes, config)
-        self.strong = config.preset != "paper"
-        self.image = image_encoder(shapes, config, images=3 if self.strong else 2)
+        self.paper = config.preset == "paper"
+        self.image = image_encoder(shapes, config, images=2 if self.paper else 3)
         self.blocks = nn.Sequential(
             *(ResidualBlock(config.features) for _ in range(config.context))
         )
-        size = config.features * (2 if self.strong else math.prod(grid(shapes, config)))
+        size = config.features * (math.prod(grid(shapes, config)) if self.paper else 2)
         self.head = head(size, config, shapes.n_actions)
 
     def forward(self, pixels: Tensor, next_pixels: Tensor) -> Tensor:
@@ -53,12 +53,12 @@ class InverseNetwork(Network):
         with self.autocast(pixels):
             features = F.relu(self._encoded(torch.cat([before, after], -3)))
             features = F.relu(self.blocks(features))
-            outputs = self.head(pool_cells(features) if self.strong else flatten_cells(features))
+            outputs = self.head(flatten_cells(features) if self.paper else pool_cells(features))
         return outputs.float().reshape(*batch, outputs.shape[-1])
 
     def _encoded(self, both: Tensor) -> Tensor:
         """Encode two images on top of each other, [N, 2 C, H, W], to [N, F, h, w]."""
-        if not self.strong:
+        if self.paper:
             return self.image(both)
         assert isinstance(self.image, PatchEncoder)
         cells = self.image.cells(both, _with_change)
@@ -87,7 +87,7 @@ def make_inverse(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"grounded"`` or ``"paper"``.
+        preset: ``"strong"``, ``"film"`` or ``"paper"``.
         in_keys: the image before and the image after, uint8 [*B, C, H, W].
         out_key: where the logits go.
         device: where to build it.

@@ -56,7 +56,7 @@ def make_policy(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"grounded"`` or ``"paper"``.
+        preset: ``"strong"``, ``"film"`` or ``"paper"``.
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         action_key: where the action goes; its log-probability goes beside it, as TorchRL names it.
         logits_key: where the logits go, float32 [*B, A].
@@ -116,7 +116,7 @@ def make_value(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"grounded"`` or ``"paper"``, all without dropout.
+        preset: ``"strong"``, ``"film"`` or ``"paper"``, all without dropout.
         init_from: a policy of the same preset and sizes whose trunk's weights are copied.
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         out_key: where the value goes.

@@ -50,7 +50,7 @@ def make_reward_model(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"grounded"`` or ``"paper"``.
+        preset: ``"strong"``, ``"film"`` or ``"paper"``.
         in_keys: the image, uint8 [*B, C, H, W], the instruction, int64 [*B, L], and the action,
             integer [*B].
         out_key: where the logit goes.

@@ -165,7 +165,7 @@ class PairScorer(Network):
 class SentenceScorer(PairScorer):
     """Scores images with an instruction that is one vector.
 
-    ``strong`` scores by residual FiLM, attention maps that tell places, and counts of the cells
+    ``film`` scores by residual FiLM, attention maps that tell places, and counts of the cells
     that fit; ``paper`` by gated attention.
     """
 
@@ -175,10 +175,13 @@ class SentenceScorer(PairScorer):
         features = config.features
         self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
         self.instruction = instruction_encoder(shapes, config)
-        self.strong = config.preset != "paper"
+        self.paper = config.preset == "paper"
         self.alone = cells_are_alone(config)
         size = self.instruction.size
-        if self.strong:
+        if self.paper:
+            self.fusion = nn.ModuleList([GatedAttention(size, features)])
+            size = features * math.prod(grid(shapes, config))
+        else:
             self.fusion = nn.ModuleList(
                 ResidualFiLM(size, features, config.kernel) for _ in range(config.n_blocks)
             )
@@ -187,9 +190,6 @@ class SentenceScorer(PairScorer):
             )
             self.count = CellCount(features, config.detectors)
             size = self.readout.size + self.count.size
-        else:
-            self.fusion = nn.ModuleList([GatedAttention(size, features)])
-            size = features * math.prod(grid(shapes, config))
         self.head = head(size, config, 1)
 
     def _features(self, images: list[Tensor]) -> Tensor:
@@ -257,7 +257,7 @@ class SentenceScorer(PairScorer):
         return self._expected(outputs.reshape(*batch, 1))
 
     def _summary(self, fused: Tensor) -> Tensor:
-        if not self.strong:
+        if self.paper:
             return flatten_cells(fused)
         return torch.cat([self.readout(fused), self.count(fused)], -1)
 

@@ -150,12 +150,14 @@ def commands_note(groups: Iterable[Sequence[Mapping[str, Any]]]) -> str:
     >>> commands_note([[run]]).splitlines()[-1].strip()
     '- `ifo-grounding run study` (commit `abc`)'
     """
-    made = [
-        f"- `{run['command']}` (commit `{run['provenance']['commit']}`)"
-        for runs in groups
-        for run in runs
-    ]
+    made = [f"- `{run['command']}` ({_made_by(run)})" for runs in groups for run in runs]
     return folded("Commands", list(dict.fromkeys(made)))
+
+
+def _made_by(run: Mapping[str, Any]) -> str:
+    made = run["provenance"]
+    commit = f"commit `{made['commit']}`"
+    return f"{commit}; {made['renamed']}" if "renamed" in made else commit
 
 
 def results_table(results: Mapping[str, Any]) -> str:
