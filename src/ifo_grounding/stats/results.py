@@ -13,10 +13,17 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _digits(rate: float) -> int:
-    """Decimals of a percentage that do not round a rare failure or success away."""
+def _digits(rate: float, width: float) -> int:
+    """Decimals of a percentage that round away neither a rare failure or success nor its interval.
+
+    Args:
+        rate: a share.
+        width: of its interval, a share too.
+    """
     rare = min(rate, 1.0 - rate)
-    return 1 if rare == 0.0 or rare >= 0.0005 else 2 if rare >= 0.00005 else 3
+    if rare == 0.0 or rare >= 0.0005:
+        return 2 if rare and width < 0.0015 else 1
+    return 2 if rare >= 0.00005 else 3
 
 
 class _Described:
@@ -53,7 +60,7 @@ class Rate(_Described):
         """Return the rate in percent, its interval and the count."""
         if not self.count:
             return "undefined (n=0)"
-        digits = _digits(self.rate)
+        digits = _digits(self.rate, self.high - self.low)
         rate, low, high = (f"{100 * x:.{digits}f}" for x in (self.rate, self.low, self.high))
         return f"{rate}% [{low}, {high}] (n={self.count})"
 
@@ -90,6 +97,8 @@ class Difference(_Described):
 
     >>> print(Difference(2.5, 1.0, 4.0, better=60, worse=10, count=2000, p_value=1e-9, method=""))
     +2.5 points [+1.0, +4.0] (60 better, 10 worse, n=2000)
+    >>> print(Difference(0.1, 0.0, 0.2, better=15, worse=5, count=10000, p_value=0.06, method=""))
+    +0.10 points [+0.00, +0.20] (15 better, 5 worse, n=10000)
     """
 
     points: float
@@ -112,7 +121,9 @@ class Difference(_Described):
     def __str__(self) -> str:
         """Return the difference, its interval and how many scenes changed."""
         changed = f"{self.better} better, {self.worse} worse, n={self.count}"
-        return f"{self.points:+.1f} points [{self.low:+.1f}, {self.high:+.1f}] ({changed})"
+        digits = 1 if self.high - self.low >= 0.25 else 2
+        points, low, high = (f"{x:+.{digits}f}" for x in (self.points, self.low, self.high))
+        return f"{points} points [{low}, {high}] ({changed})"
 
 
 def check_confidence(confidence: float) -> None:
