@@ -207,7 +207,7 @@ class WordMaps(nn.Module):
         heard = swap_words(tokens, self.swapped) if self.training else tokens
         code = torch.tanh(self.role(heard)) * alive
         beside = F.relu(over_words(self.beside, code)) * alive
-        relevance = over_words(self.relevance, beside).softmax(-1)
+        relevance = over_words(self.relevance, beside).movedim(-1, 1).softmax(1).movedim(1, -1)
         side = torch.tanh(self.side(tokens))
         if self.training:
             side = side + self.noise * torch.randn_like(side)
