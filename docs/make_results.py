@@ -35,8 +35,8 @@ NAMES = {
     "phase2": "phase 2",
 }
 
-LEVELS = [("GoToObj", 1000), ("GoToLocal", 1000), ("PickupLoc", 1000)]
-"""Levels of BabyAI and numbers of demonstrations that the page speaks of, run or not."""
+LEVELS = ("GoToObj", "GoToLocal", "PickupLoc")
+"""Levels of BabyAI that the page speaks of, run or not, with 1,000 demonstrations at least."""
 
 Key = tuple[str, int, str, float]
 """Of a study: task, demonstrations, preset and variant, and the share held out."""
@@ -176,22 +176,28 @@ def imitation_section() -> list[str]:
 
 def babyai_section() -> list[str]:
     """Return what was measured in the levels of BabyAI."""
-    ran = read_results(ROOT / "results" / "babyai", lambda o: (o["task"], o["demonstrations"]["n"]))
-    found = {**{level: [] for level in LEVELS}, **ran}
+    ran = read_results(
+        ROOT / "results" / "babyai", lambda o: (o["task"], o["demonstrations"]["n"], o["network"])
+    )
+    known = {level for level, _, _ in ran}
+    waiting = {(level, 1000, ""): [] for level in LEVELS if level not in known}
+    order = [*LEVELS, *sorted(known.difference(LEVELS))]
+    found = sorted({**waiting, **ran}.items(), key=lambda of: (order.index(of[0][0]), *of[0][1:]))
     return [
         "## BabyAI",
         "Greedy success by BabyAI's own reward in fixed rooms, in percent, with 95% intervals over"
         " seeds and rooms. [How it is set up](babyai.md). `true actions` imitates what the bot did"
         " in place of labels, which no learner may read: an upper reference for phase 1, as the bot"
         " itself is.",
-        markdown_table([babyai_row(*level, runs) for level, runs in found.items()]),
+        markdown_table([babyai_row(*level, runs) for level, runs in found]),
         *([commands_note(ran.values())] if ran else []),
     ]
 
 
-def babyai_row(level: str, n: int, runs: list[dict[str, Any]]) -> dict[str, Any]:
+def babyai_row(level: str, n: int, preset: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Compare both phases in one level with their references."""
-    row: dict[str, Any] = {"level": level, "demonstrations": f"{n:,}", "seeds": len(runs)}
+    row: dict[str, Any] = {"level": level, "demonstrations": f"{n:,}", "preset": preset}
+    row["seeds"] = len(runs)
     columns = {
         "bot": "demonstrator",
         "true actions": "true_actions",

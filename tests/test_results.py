@@ -82,7 +82,12 @@ def test_levels_of_babyai_are_compared_with_their_references(tmp_path, monkeypat
     solved = {"phase1": "f0", "phase2": "fc", "true_actions": "f8", "demonstrator": "ff"}
     results = {name: {"outcomes": bits, "rate": {"count": 8}} for name, bits in solved.items()}
     run = {
-        "options": {"task": "GoToObj", "demonstrations": {"n": 1000}, "seed": 0},
+        "options": {
+            "task": "GoToObj",
+            "demonstrations": {"n": 1000},
+            "network": "film",
+            "seed": 0,
+        },
         "results": results,
         "command": "ifo-grounding run study world=babyai",
         "provenance": {"commit": "abc"},
@@ -90,7 +95,7 @@ def test_levels_of_babyai_are_compared_with_their_references(tmp_path, monkeypat
     write_json(folder / "0.json", run)
     monkeypatch.setattr(script, "ROOT", tmp_path)
     lines = "\n".join(script.babyai_section()).splitlines()
-    [ran] = [line for line in lines if line.startswith("| GoToObj |")]
+    [ran] = [line for line in lines if line.startswith("| GoToObj | 1,000 | film | 1 |")]
     assert all(f"| {rate}% [" in ran for rate in ("100.0", "62.5", "50.0", "75.0"))
     assert "| +25.0 [" in ran and "not run" not in ran
     [waiting] = [line for line in lines if line.startswith("| GoToLocal |")]
