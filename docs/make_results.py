@@ -56,10 +56,14 @@ def studies() -> dict[Key, list[dict[str, Any]]]:
 
 def study_of(options: Mapping[str, Any]) -> Key:
     """Return to which study a run belongs."""
-    variant = options.get("variant")
-    kind = f"{options['network']}, {variant}" if variant else options["network"]
     held_out = options["imitate"].get("held_out", 0.0)
-    return options["task"], options["demonstrations"]["n"], kind, held_out
+    return options["task"], options["demonstrations"]["n"], preset_of(options), held_out
+
+
+def preset_of(options: Mapping[str, Any]) -> str:
+    """Return the preset of a run, with its variant where it has one."""
+    variant = options.get("variant")
+    return f"{options['network']}, {variant}" if variant else options["network"]
 
 
 def study_section() -> list[str]:
@@ -177,7 +181,7 @@ def imitation_section() -> list[str]:
 def babyai_section() -> list[str]:
     """Return what was measured in the levels of BabyAI."""
     ran = read_results(
-        ROOT / "results" / "babyai", lambda o: (o["task"], o["demonstrations"]["n"], o["network"])
+        ROOT / "results" / "babyai", lambda o: (o["task"], o["demonstrations"]["n"], preset_of(o))
     )
     known = {level for level, _, _ in ran}
     waiting = {(level, 1000, ""): [] for level in LEVELS if level not in known}

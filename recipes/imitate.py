@@ -58,7 +58,8 @@ def imitate_transitions(
 
 def imitation(options: DictConfig, seed: int) -> ImitationLoss:
     """Return the loss of a policy with the initial weights of a seed."""
-    return ImitationLoss(build(make_policy, options, seed=seed))
+    context = options.imitate.get("context", 0)
+    return ImitationLoss(build(make_policy, options, seed=seed, context=context))
 
 
 class Beginning:

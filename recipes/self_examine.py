@@ -37,7 +37,8 @@ def examine(options: DictConfig) -> dict:
         return stage.result
     run = stage.run
     policy = load_network(run, POLICIES[0], "imitate", options)
-    value = build(networks.make_value, options, init_from=policy)
+    context = options.imitate.get("context", 0)
+    value = build(networks.make_value, options, init_from=policy, context=context)
     env, reward, adversary = practice(run, options)
     seen, aside = labelled_demonstrations(run, options.imitate.held_out)
     weight = section.rehearsal

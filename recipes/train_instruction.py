@@ -26,8 +26,9 @@ def train_instruction(options: DictConfig) -> dict:
         return stage.result
     demos = load_demonstrations(stage.run)
     policy = starting_policy(stage.run, options, "instruction")
+    context = options.imitate.get("context", 0) if policy is not None else 0
     loss = InstructionLoss(
-        build(make_instruction_classifier, options, init_from=policy),
+        build(make_instruction_classifier, options, init_from=policy, context=context),
         demos.pool(),
         negatives=options.instruction.negatives,
         removal_rate=options.instruction.removal_rate,

@@ -34,7 +34,9 @@ class NetworkConfig:
     kernel: int
     """Cells across that a residual block sees: 1 for the cell alone (``film``, ``strong``)."""
     context: int
-    """Residual blocks of kernel 3 before the instruction comes in (``film``, ``strong``)."""
+    """How far what lies around a cell is seen: residual blocks of kernel 3 before the instruction
+    comes in (``film``), convolutions of kernel 3 for what hears no words (``strong``: policy and
+    critic; its judges see one cell around anyway)."""
     heads: int
     """Attention maps that the head reads (``film``, ``strong``)."""
     values: int

@@ -8,6 +8,7 @@ evidence about each cell; and walking and stopping see forms and those maps alon
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -32,6 +33,8 @@ ROLE, SIDE = 8, 4
 """Sizes of the codes from which a word's role and the manner are read."""
 MANNER = 8
 """Size of what the instruction says besides places: a side, for example."""
+FORMS, AROUND = 8, 16
+"""Sizes of what is seen of a cell by its neighbours, and of what lies around each cell."""
 CONTRAST = 8.0
 """How sharply an edge is seen: neighbours that differ by 0.1 of the range of a pixel count 0.7."""
 
@@ -243,7 +246,8 @@ class GroundedTrunk(nn.Module):
 
     Attention maps of two kinds read the image: those of :class:`WordMaps`, which give places and
     nothing else, and those that see silhouettes and no words, which give places, what is seen
-    there, and how much of each word map lies there.
+    there, and how much of each word map lies there. With ``context`` they also give what lies
+    around their places, such as a wall before the agent.
 
     Attributes:
         both_ways: whether each word map is read as evidence for places and as evidence against
@@ -262,10 +266,23 @@ class GroundedTrunk(nn.Module):
         self.attention = nn.Linear(config.features, config.heads)
         nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
         self.value = nn.Linear(config.features, config.values)
-        places = cell_places(PatchEncoder.grid(height, width, patch))
+        self.around: nn.Sequential | None = None
+        seen = config.values
+        if config.context:
+            self.form = nn.Linear(config.features, FORMS)
+            sizes = (FORMS, *[AROUND] * config.context)
+            layers = (
+                layer
+                for before, after in itertools.pairwise(sizes)
+                for layer in (nn.Conv2d(before, after, 3, padding=1), nn.ReLU())
+            )
+            self.around = nn.Sequential(*layers)
+            seen += AROUND
+        self.grid = PatchEncoder.grid(height, width, patch)
+        places = cell_places(self.grid)
         self.register_buffer("place", places, persistent=False)
         maps = 2 * config.maps
-        self.size = config.heads * (2 + config.values + maps) + 2 * maps + MANNER
+        self.size = config.heads * (2 + seen + maps) + 2 * maps + MANNER
 
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
@@ -276,6 +293,8 @@ class GroundedTrunk(nn.Module):
         maps = self.weigh(logits)
         silent = torch.cat([self.attention(looks.silhouette), self.value(looks.silhouette)], -1)
         silent = look_up(silent, looks.where)
+        if self.around is not None:
+            silent = torch.cat([silent, self._surroundings(looks)], -1)
         heads = self.attention.out_features
         attention = silent[..., :heads].transpose(1, 2).softmax(-1)
         place = self.place.to(maps.dtype)
@@ -285,6 +304,12 @@ class GroundedTrunk(nn.Module):
             attention @ maps.transpose(1, 2),
         ]
         return torch.cat([torch.cat(seen, -1).flatten(1), (maps @ place).flatten(1), manner], -1)
+
+    def _surroundings(self, looks: Looks) -> Tensor:
+        """Return what lies around each cell, [N, h * w, AROUND]."""
+        assert self.around is not None
+        forms = look_up(F.relu(self.form(looks.silhouette)), looks.where)
+        return self.around(forms.unflatten(1, self.grid).movedim(-1, 1)).flatten(2).transpose(1, 2)
 
     def weigh(self, logits: Tensor) -> Tensor:
         """Weigh cells [N, maps, h * w] by evidence for and against them: [N, 2 * maps, h * w]."""

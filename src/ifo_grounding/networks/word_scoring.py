@@ -14,13 +14,10 @@ from ifo_grounding.networks.cells import Cells, Kinds, group_cells, hidden_from_
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import without_padding
 from ifo_grounding.networks.fusion import cell_places
-from ifo_grounding.networks.grounding import MANNER, ColourAndForm, WordMaps
+from ifo_grounding.networks.grounding import AROUND, FORMS, MANNER, ColourAndForm, WordMaps
 from ifo_grounding.networks.scoring import ROWS_AT_ONCE, PairScorer, slices
 from ifo_grounding.networks.shapes import Shapes, patch_size
 from ifo_grounding.networks.trunk import grid, head, same_batch
-
-FORMS, AROUND = 8, 16
-"""Sizes of what is seen of a cell by its neighbours, and of what lies around each cell."""
 
 
 class Seen(NamedTuple):
