@@ -57,7 +57,7 @@ def trace_episode(
     >>> (episode,) = record_episodes(policy, "move", [0])
     >>> trace = trace_episode(policy, episode, {"goal": make_goal_judge(env, seed=0)})
     >>> trace.probabilities.shape[1], trace.maps.shape[1:], sorted(trace.rewards)
-    (6, (8, 6, 6), ['goal'])
+    (6, (16, 6, 6), ['goal'])
     """
     steps, device = len(episode.actions), device_of(policy)
     words = vocabulary or VOCABULARY

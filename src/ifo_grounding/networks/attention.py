@@ -27,7 +27,7 @@ def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Te
     >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> words = torch.ones(2, 16, dtype=torch.int64)
     >>> attention_maps(policy, torch.zeros(2, 3, 48, 48), words).shape
-    torch.Size([2, 8, 6, 6])
+    torch.Size([2, 16, 6, 6])
     """
     network = instructed_network(policy)
     image, _ = network.flat_pixels(pixels)

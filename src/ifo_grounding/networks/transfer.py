@@ -18,7 +18,7 @@ def trunk_of(policy: nn.Module) -> Trunk | GroundedTrunk:
 
     >>> from ifo_grounding.networks import Shapes, make_policy
     >>> trunk_of(make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))).size
-    144
+    312
     """
     return instructed_network(policy).trunk
 
