@@ -152,6 +152,11 @@ def open_world(options: DictConfig) -> World:
     return WORLDS[options.simulator](options)
 
 
+def context_of(options: DictConfig, section: str) -> int:
+    """Return over how many neighbouring cells a section's network sees, 0 where not said."""
+    return options[section].get("context", 0)
+
+
 def build(make: Callable[..., Any], options: DictConfig, **kwargs: Any) -> Any:
     """Build a network for the simulator's images, words and actions."""
     chosen = {"seed": options.seed, "device": options.device, **kwargs}

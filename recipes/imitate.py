@@ -12,7 +12,7 @@ from _shared import (
     shows_progress,
     train,
 )
-from _worlds import build
+from _worlds import build, context_of
 from omegaconf import DictConfig
 from torch import Tensor
 from torchrl.data import ReplayBuffer
@@ -58,7 +58,7 @@ def imitate_transitions(
 
 def imitation(options: DictConfig, seed: int) -> ImitationLoss:
     """Return the loss of a policy with the initial weights of a seed."""
-    context = options.imitate.get("context", 0)
+    context = context_of(options, "imitate")
     return ImitationLoss(build(make_policy, options, seed=seed, context=context))
 
 

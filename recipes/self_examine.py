@@ -16,7 +16,7 @@ from _shared import (
     self_examination_config,
     shows_progress,
 )
-from _worlds import build, open_world
+from _worlds import build, context_of, open_world
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig
 from torchrl.envs import Compose, TransformedEnv
@@ -37,7 +37,7 @@ def examine(options: DictConfig) -> dict:
         return stage.result
     run = stage.run
     policy = load_network(run, POLICIES[0], "imitate", options)
-    context = options.imitate.get("context", 0)
+    context = context_of(options, "imitate")
     value = build(networks.make_value, options, init_from=policy, context=context)
     env, reward, adversary = practice(run, options)
     seen, aside = labelled_demonstrations(run, options.imitate.held_out)

@@ -1,7 +1,7 @@
 """Train the goal judge: whether an instruction is fulfilled (an extension of the paper)."""
 
 from _shared import GOAL, load_demonstrations, open_stage, starting_policy, train
-from _worlds import build
+from _worlds import build, context_of
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
@@ -17,7 +17,7 @@ def train_goal(options: DictConfig) -> dict:
         return stage.result
     demos = load_demonstrations(stage.run)
     policy = starting_policy(stage.run, options, "goal")
-    context = options.goal.get("context", 0)
+    context = context_of(options, "goal")
     loss = GoalLoss(
         build(make_goal_judge, options, init_from=policy, context=context),
         demos.pool(),

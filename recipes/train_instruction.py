@@ -7,7 +7,7 @@ from _shared import (
     starting_policy,
     train,
 )
-from _worlds import build
+from _worlds import build, context_of
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
@@ -26,7 +26,7 @@ def train_instruction(options: DictConfig) -> dict:
         return stage.result
     demos = load_demonstrations(stage.run)
     policy = starting_policy(stage.run, options, "instruction")
-    context = options.imitate.get("context", 0) if policy is not None else 0
+    context = context_of(options, "imitate") if policy is not None else 0
     loss = InstructionLoss(
         build(make_instruction_classifier, options, init_from=policy, context=context),
         demos.pool(),

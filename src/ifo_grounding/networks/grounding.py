@@ -308,8 +308,8 @@ class GroundedTrunk(nn.Module):
     def _surroundings(self, looks: Looks) -> Tensor:
         """Return what lies around each cell, [N, h * w, AROUND]."""
         assert self.around is not None
-        forms = look_up(F.relu(self.form(looks.silhouette)), looks.where)
-        return self.around(forms.unflatten(1, self.grid).movedim(-1, 1)).flatten(2).transpose(1, 2)
+        forms = look_up(self.form(looks.silhouette), looks.where)
+        return surroundings(self.around, forms, self.grid)
 
     def weigh(self, logits: Tensor) -> Tensor:
         """Weigh cells [N, maps, h * w] by evidence for and against them: [N, 2 * maps, h * w]."""
@@ -324,6 +324,18 @@ class GroundedTrunk(nn.Module):
         """Return how each map weighs the cells of an image: [N, 2 * maps, h * w]."""
         logits, _ = self.words(self.looks(image), tokens.long())
         return self.weigh(logits)
+
+
+def surroundings(layers: nn.Module, forms: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Return what lies around each cell, [N, h * w, AROUND], by the forms there [N, h * w, FORMS].
+
+    Args:
+        layers: convolutions over the cells, [N, FORMS, h, w] to [N, AROUND, h, w].
+        forms: what cells show their neighbours, before the ReLU.
+        grid: h and w.
+    """
+    around: Tensor = layers(F.relu(forms).unflatten(1, grid).movedim(-1, 1))
+    return around.flatten(2).transpose(1, 2)
 
 
 def _spread(evidence: Tensor) -> Tensor:

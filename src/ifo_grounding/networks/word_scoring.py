@@ -14,7 +14,14 @@ from ifo_grounding.networks.cells import Cells, Kinds, group_cells, hidden_from_
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import without_padding
 from ifo_grounding.networks.fusion import cell_places
-from ifo_grounding.networks.grounding import AROUND, FORMS, MANNER, ColourAndForm, WordMaps
+from ifo_grounding.networks.grounding import (
+    AROUND,
+    FORMS,
+    MANNER,
+    ColourAndForm,
+    WordMaps,
+    surroundings,
+)
 from ifo_grounding.networks.scoring import ROWS_AT_ONCE, PairScorer, slices
 from ifo_grounding.networks.shapes import Shapes, patch_size
 from ifo_grounding.networks.trunk import grid, head, same_batch
@@ -98,8 +105,7 @@ class WordScorer(PairScorer):
     def _surroundings(self, tables: list[Seen]) -> Tensor:
         """Return what lies around each cell, [N, h * w, AROUND]."""
         forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
-        forms = forms.unflatten(1, grid(self.shapes, self.config)).movedim(-1, 1)
-        return F.relu(self.around(F.relu(forms))).flatten(2).transpose(1, 2)
+        return F.relu(surroundings(self.around, forms, grid(self.shapes, self.config)))
 
     def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:
         """Encode images, each [N, C, H, W], those of their cells that look alike once."""

@@ -21,9 +21,11 @@ def _digits(rate: float, width: float) -> int:
         width: of its interval, a share too.
     """
     rare = min(rate, 1.0 - rate)
-    if rare == 0.0 or rare >= 0.0005:
-        return 2 if rare and width < 0.0015 else 1
-    return 2 if rare >= 0.00005 else 3
+    if not rare:
+        return 1
+    if rare < 0.00005:
+        return 3
+    return 2 if rare < 0.0005 or width < 0.0015 else 1
 
 
 class _Described:
