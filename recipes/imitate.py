@@ -59,7 +59,8 @@ def imitate_transitions(
 def imitation(options: DictConfig, seed: int) -> ImitationLoss:
     """Return the loss of a policy with the initial weights of a seed."""
     context = context_of(options, "imitate")
-    return ImitationLoss(build(make_policy, options, seed=seed, context=context))
+    policy = build(make_policy, options, seed=seed, context=context)
+    return ImitationLoss(policy, strict_from=options.imitate.get("strict_from", 0.0))
 
 
 class Beginning:

@@ -63,3 +63,17 @@ def take_charge(module: nn.Module) -> Tensor | None:
             total = charge if total is None else total + charge
             part.charge = None  # type: ignore[assignment]
     return total
+
+
+def set_lenient(module: nn.Module, lenient: bool) -> None:
+    """Tell the parts of a module that have a ``lenient`` whether they may be so for now.
+
+    >>> part = nn.Linear(1, 1)
+    >>> part.lenient = False
+    >>> set_lenient(nn.Sequential(part), True)
+    >>> part.lenient
+    True
+    """
+    for part in module.modules():
+        if hasattr(part, "lenient"):
+            part.lenient = lenient  # type: ignore[assignment]

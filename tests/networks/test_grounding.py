@@ -10,7 +10,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import episode_endings
 from ifo_grounding.modules import take_charge
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy, make_value
-from ifo_grounding.networks.grounding import MANNER, swap_words
+from ifo_grounding.networks.grounding import BEARINGS, MANNER, swap_words
 from ifo_grounding.networks.transfer import trunk_of
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
@@ -109,6 +109,33 @@ def test_what_words_say_is_charged_for_in_training(shapes):
     assert "loss_words" not in ImitationLoss(make_policy(shapes, "film", seed=0))(batch)
 
 
+def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
+    policy = make_policy(shapes, "strong", seed=0)
+    words = trunk_of(policy).words
+    sentences = ["move to the red circle", "move to the blue triangle"]
+    batch = TensorDict(
+        {
+            "pixels": tiles("red circle", "blue triangle").expand(2, -1, -1, -1),
+            "instruction": VOCABULARY.encode(sentences),
+            "action": torch.tensor([5, 0]),
+        },
+        [2],
+    )
+    loss = ImitationLoss(policy, strict_from=0.5)
+    assert loss(batch)["loss_words"] == 0
+    torch.manual_seed(0)
+    as_said = words.eval().roles(batch["instruction"])[0]
+    assert words.train().roles(batch["instruction"])[0].equal(as_said)
+
+    loss.set_progress(0.5)
+    assert loss(batch)["loss_words"] > 0
+    assert not words.roles(batch["instruction"])[0].equal(as_said)
+    loss.set_progress(0.0)  # as when training begins once more
+    assert loss(batch)["loss_words"] == 0
+    with pytest.raises(UserError, match=r"share of training in \[0, 1\], got 2"):
+        ImitationLoss(policy, strict_from=2)
+
+
 def test_words_outside_the_vocabulary_are_named(shapes):
     policy = make_policy(shapes, "strong", seed=0)
     with pytest.raises(UserError, match="token ids from 1 to 99"):
@@ -140,23 +167,42 @@ def what_is_seen(trunk, image, words="red circle"):
         trunk.attention.bias.zero_()
         both = trunk(image, VOCABULARY.encode([words]))[0]
     maps, heads = 2 * trunk.words.relevance.out_channels, trunk.attention.out_features
-    each = (len(both) - 2 * maps - MANNER) // heads
+    turned = BEARINGS * 2 * (heads + maps) if trunk.bearing is not None else 0
+    each = (len(both) - turned - 2 * maps - MANNER) // heads
     return both[2 : each - maps]
 
 
 @pytest.mark.parametrize("context", [0, 1, 2])
-def test_what_lies_around_is_seen_without_words(shapes, context):
+def test_what_lies_around_is_seen(shapes, context):
     policy = make_policy(shapes, "strong", seed=0, context=context)
     trunk = trunk_of(policy)
     near, far = tiles("red circle", "blue triangle", arm=20), tiles("red circle", arm=20)
     far[:, :, 32:40, 8:16] = near[:, :, :8, 8:16]  # the triangle, elsewhere
     assert torch.allclose(what_is_seen(trunk, near), what_is_seen(trunk, far)) == (context == 0)
-    assert torch.equal(what_is_seen(trunk, near), what_is_seen(trunk, near, "blue triangle"))
+    other_words = what_is_seen(trunk, near, "blue triangle")  # seen as maps of where they point
+    assert torch.equal(what_is_seen(trunk, near), other_words) == (context == 0)
     critic = make_value(shapes, "strong", init_from=policy, context=context)
     theirs = critic.module.trunk.state_dict()
     assert all(torch.equal(theirs[name], weight) for name, weight in trunk.state_dict().items())
     with pytest.raises(UserError, match="the trunk of init_from does not fit"):
         make_value(shapes, "strong", init_from=policy, context=context + 1)
+
+
+def test_bearings_turn_all_places(shapes):
+    trunk = trunk_of(make_policy(shapes, "strong", seed=0, context=1))
+    maps, heads = 2 * trunk.words.relevance.out_channels, trunk.attention.out_features
+    count = 2 * (heads + maps)
+    with torch.no_grad():
+        trunk.bearing.weight.zero_()
+        trunk.bearing.bias.copy_(torch.tensor([20.0, -20.0, 0.0, 20.0]))
+        image = tiles("red circle", "blue triangle")
+        known = trunk(image, VOCABULARY.encode(["red circle"]))[0]
+    known, turned = known[: -BEARINGS * count], known[-BEARINGS * count :].view(BEARINGS, count)
+    pointed = known[-MANNER - 2 * maps : -MANNER]
+    own = known[: -MANNER - 2 * maps].view(heads, -1)[:, :2].flatten()
+    places = torch.cat([own, pointed])
+    assert places.abs().max() > 0.1
+    torch.testing.assert_close(turned, torch.stack([places, -places, 0 * places, places]))
 
 
 def test_padding_says_nothing(shapes):

@@ -35,8 +35,8 @@ class NetworkConfig:
     """Cells across that a residual block sees: 1 for the cell alone (``film``, ``strong``)."""
     context: int
     """How far what lies around a cell is seen: residual blocks of kernel 3 before the instruction
-    comes in (``film``), convolutions of kernel 3 for what hears no words (``strong``: policy and
-    critic; its judges see one cell around anyway)."""
+    comes in (``film``), convolutions of kernel 3 over forms and word maps, and places read in the
+    light of what is seen (``strong``: policy and critic; its judges see one cell around anyway)."""
     heads: int
     """Attention maps that the head reads (``film``, ``strong``)."""
     values: int

@@ -35,6 +35,8 @@ MANNER = 8
 """Size of what the instruction says besides places: a side, for example."""
 FORMS, AROUND = 8, 16
 """Sizes of what is seen of a cell by its neighbours, and of what lies around each cell."""
+BEARINGS = 4
+"""In how many ways places are read in the light of what is seen, such as where the agent faces."""
 CONTRAST = 8.0
 """How sharply an edge is seen: neighbours that differ by 0.1 of the range of a pixel count 0.7."""
 
@@ -121,11 +123,14 @@ class WordMaps(nn.Module):
             cells of its evidence about colours plus that of its evidence about form. A loss that
             charges for it makes a word speak about one of the two.
         swapped: share of the words that are swapped in training.
+        lenient: whether nothing is swapped for now: while words are still being found, a role
+            that others make uncertain can keep them from it.
         noise: on the code from which the manner is read, in training.
         pace: share by which each batch in training changes what counts as usually said.
     """
 
     swapped = 0.8
+    lenient = False
     noise = 0.7
     pace = 0.05
 
@@ -207,7 +212,8 @@ class WordMaps(nn.Module):
     def roles(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much words count for each map [N, L, maps], and the manner [N, MANNER]."""
         alive = (tokens != 0).unsqueeze(-1)
-        heard = swap_words(tokens, self.swapped) if self.training else tokens
+        swaps = self.training and not self.lenient
+        heard = swap_words(tokens, self.swapped) if swaps else tokens
         code = torch.tanh(self.role(heard)) * alive
         beside = F.relu(over_words(self.beside, code)) * alive
         relevance = over_words(self.relevance, beside).movedim(-1, 1).softmax(1).movedim(1, -1)
@@ -246,8 +252,10 @@ class GroundedTrunk(nn.Module):
 
     Attention maps of two kinds read the image: those of :class:`WordMaps`, which give places and
     nothing else, and those that see silhouettes and no words, which give places, what is seen
-    there, and how much of each word map lies there. With ``context`` they also give what lies
-    around their places, such as a wall before the agent.
+    there, and how much of each word map lies there. With ``context`` they also give which forms
+    and word maps lie around their places, such as a wall or the target before the agent, and all
+    places times a few features of what is seen: to whom faces east, what lies in the north is on
+    the left.
 
     Attributes:
         both_ways: whether each word map is read as evidence for places and as evidence against
@@ -267,10 +275,11 @@ class GroundedTrunk(nn.Module):
         nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
         self.value = nn.Linear(config.features, config.values)
         self.around: nn.Sequential | None = None
-        seen = config.values
+        self.bearing: nn.Linear | None = None
+        seen, maps = config.values, 2 * config.maps
         if config.context:
             self.form = nn.Linear(config.features, FORMS)
-            sizes = (FORMS, *[AROUND] * config.context)
+            sizes = (FORMS + maps, *[AROUND] * config.context)
             layers = (
                 layer
                 for before, after in itertools.pairwise(sizes)
@@ -278,11 +287,14 @@ class GroundedTrunk(nn.Module):
             )
             self.around = nn.Sequential(*layers)
             seen += AROUND
+            self.bearing = nn.Linear(config.heads * seen, BEARINGS)
+            nn.init.normal_(self.bearing.weight, std=4 / math.sqrt(config.heads * seen))
         self.grid = PatchEncoder.grid(height, width, patch)
         places = cell_places(self.grid)
         self.register_buffer("place", places, persistent=False)
-        maps = 2 * config.maps
         self.size = config.heads * (2 + seen + maps) + 2 * maps + MANNER
+        if self.bearing is not None:
+            self.size += BEARINGS * 2 * (config.heads + maps)
 
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
@@ -294,22 +306,24 @@ class GroundedTrunk(nn.Module):
         silent = torch.cat([self.attention(looks.silhouette), self.value(looks.silhouette)], -1)
         silent = look_up(silent, looks.where)
         if self.around is not None:
-            silent = torch.cat([silent, self._surroundings(looks)], -1)
+            silent = torch.cat([silent, self._surroundings(looks, maps)], -1)
         heads = self.attention.out_features
         attention = silent[..., :heads].transpose(1, 2).softmax(-1)
         place = self.place.to(maps.dtype)
-        seen = [
-            attention @ place,
-            attention @ silent[..., heads:],
-            attention @ maps.transpose(1, 2),
-        ]
-        return torch.cat([torch.cat(seen, -1).flatten(1), (maps @ place).flatten(1), manner], -1)
+        own, pointed, seen = attention @ place, maps @ place, attention @ silent[..., heads:]
+        read = torch.cat([own, seen, attention @ maps.transpose(1, 2)], -1)
+        known = [read.flatten(1), pointed.flatten(1), manner]
+        if self.bearing is not None:
+            bearing = torch.tanh(self.bearing(seen.flatten(1)))
+            places = torch.cat([own, pointed], 1).flatten(1)
+            known.append((bearing.unsqueeze(-1) * places.unsqueeze(1)).flatten(1))
+        return torch.cat(known, -1)
 
-    def _surroundings(self, looks: Looks) -> Tensor:
-        """Return what lies around each cell, [N, h * w, AROUND]."""
+    def _surroundings(self, looks: Looks, maps: Tensor) -> Tensor:
+        """Return what lies around each cell, [N, h * w, AROUND], forms and maps."""
         assert self.around is not None
-        forms = look_up(self.form(looks.silhouette), looks.where)
-        return surroundings(self.around, forms, self.grid)
+        forms = look_up(F.relu(self.form(looks.silhouette)), looks.where)
+        return surroundings(self.around, torch.cat([forms, maps.transpose(1, 2)], -1), self.grid)
 
     def weigh(self, logits: Tensor) -> Tensor:
         """Weigh cells [N, maps, h * w] by evidence for and against them: [N, 2 * maps, h * w]."""
@@ -326,15 +340,15 @@ class GroundedTrunk(nn.Module):
         return self.weigh(logits)
 
 
-def surroundings(layers: nn.Module, forms: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Return what lies around each cell, [N, h * w, AROUND], by the forms there [N, h * w, FORMS].
+def surroundings(layers: nn.Module, shown: Tensor, grid: tuple[int, int]) -> Tensor:
+    """Return what lies around each cell, [N, h * w, AROUND].
 
     Args:
-        layers: convolutions over the cells, [N, FORMS, h, w] to [N, AROUND, h, w].
-        forms: what cells show their neighbours, before the ReLU.
+        layers: convolutions over the cells, [N, F, h, w] to [N, AROUND, h, w].
+        shown: what cells show their neighbours, [N, h * w, F].
         grid: h and w.
     """
-    around: Tensor = layers(F.relu(forms).unflatten(1, grid).movedim(-1, 1))
+    around: Tensor = layers(shown.unflatten(1, grid).movedim(-1, 1))
     return around.flatten(2).transpose(1, 2)
 
 

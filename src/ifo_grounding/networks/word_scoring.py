@@ -105,7 +105,7 @@ class WordScorer(PairScorer):
     def _surroundings(self, tables: list[Seen]) -> Tensor:
         """Return what lies around each cell, [N, h * w, AROUND]."""
         forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
-        return F.relu(surroundings(self.around, forms, grid(self.shapes, self.config)))
+        return F.relu(surroundings(self.around, F.relu(forms), grid(self.shapes, self.config)))
 
     def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:
         """Encode images, each [N, C, H, W], those of their cells that look alike once."""

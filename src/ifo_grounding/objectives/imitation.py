@@ -10,7 +10,8 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 
 from ifo_grounding import keys
-from ifo_grounding.modules import take_charge
+from ifo_grounding.errors import UserError
+from ifo_grounding.modules import set_lenient, take_charge
 from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
 
 CONFIDENCE = 4
@@ -31,6 +32,9 @@ class ImitationLoss(SupervisedLoss):
         network: a policy with ``get_dist``, as ``make_policy`` builds it.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         charge: weight of ``loss_words``.
+        strict_from: share of training, see :meth:`set_progress`, before which words are neither
+            charged for nor swapped. Where actions are easy to guess without words, they are
+            otherwise held to one meaning before they have any.
 
     >>> import torch
     >>> from ifo_grounding.networks import Shapes, make_policy
@@ -54,10 +58,28 @@ class ImitationLoss(SupervisedLoss):
     out_keys = ["loss_imitation", "accuracy", "entropy"]  # noqa: RUF012
 
     def __init__(
-        self, network: TensorDictModule, *, reduction: str = "mean", charge: float = 0.02
+        self,
+        network: TensorDictModule,
+        *,
+        reduction: str = "mean",
+        charge: float = 0.02,
+        strict_from: float = 0.0,
     ) -> None:
         super().__init__(network, reduction=reduction)
+        if not 0 <= strict_from <= 1:
+            raise UserError(f"strict_from is a share of training in [0, 1], got {strict_from}")
         self.charge = charge
+        self.strict_from = strict_from
+        self.strict = True
+        self.set_progress(0.0)
+
+    def set_progress(self, fraction: float) -> None:
+        """Say which share of training is done."""
+        strict = fraction >= self.strict_from
+        if strict == self.strict:
+            return
+        self.strict = strict
+        set_lenient(self.network, not strict)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -74,7 +96,8 @@ class ImitationLoss(SupervisedLoss):
         words = {}
         if charged is not None:
             likelihood = (-self._mean(loss, tensordict)).exp()
-            words = {"loss_words": self.charge * likelihood**CONFIDENCE * charged}
+            weight = self.charge if self.strict else 0.0
+            words = {"loss_words": weight * likelihood**CONFIDENCE * charged}
         return scalars(
             loss_imitation=self._reduce_loss(loss, tensordict),
             **words,
