@@ -32,7 +32,7 @@ from ifo_grounding.errors import check_choice
 from ifo_grounding.evaluation import episode_endings, probe
 from ifo_grounding.evaluation.endings import SUCCESS
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
-from ifo_grounding.networks.grounding import EVIDENCE, Looks
+from ifo_grounding.networks.looks import EVIDENCE, Looks
 from ifo_grounding.networks.transfer import trunk_of
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.report import text_table

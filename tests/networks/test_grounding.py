@@ -132,6 +132,8 @@ def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
     assert not words.roles(batch["instruction"])[0].equal(as_said)
     loss.set_progress(0.0)  # as when training begins once more
     assert loss(batch)["loss_words"] == 0
+    ImitationLoss(policy)  # which is strict from the beginning, whatever came before
+    assert not words.lenient
     with pytest.raises(UserError, match=r"share of training in \[0, 1\], got 2"):
         ImitationLoss(policy, strict_from=2)
 

@@ -20,13 +20,10 @@ from ifo_grounding.networks.fusion import (
     pool_cells,
 )
 from ifo_grounding.networks.goal import make_goal_judge
-from ifo_grounding.networks.grounding import (
-    ColourAndForm,
-    GroundedTrunk,
-    WordMaps,
-)
+from ifo_grounding.networks.grounding import GroundedTrunk, WordMaps
 from ifo_grounding.networks.instruction import make_instruction_classifier
 from ifo_grounding.networks.inverse import InverseNetwork, make_inverse
+from ifo_grounding.networks.looks import ColourAndForm
 from ifo_grounding.networks.persistence import load, save
 from ifo_grounding.networks.policy import PolicyNetwork, ValueNetwork, make_policy, make_value
 from ifo_grounding.networks.reward import RewardNetwork, make_reward_model

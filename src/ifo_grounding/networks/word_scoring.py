@@ -18,10 +18,10 @@ from ifo_grounding.networks.grounding import (
     AROUND,
     FORMS,
     MANNER,
-    ColourAndForm,
     WordMaps,
     surroundings,
 )
+from ifo_grounding.networks.looks import ColourAndForm
 from ifo_grounding.networks.scoring import ROWS_AT_ONCE, PairScorer, slices
 from ifo_grounding.networks.shapes import Shapes, patch_size
 from ifo_grounding.networks.trunk import grid, head, same_batch

@@ -70,7 +70,7 @@ class ImitationLoss(SupervisedLoss):
             raise UserError(f"strict_from is a share of training in [0, 1], got {strict_from}")
         self.charge = charge
         self.strict_from = strict_from
-        self.strict = True
+        self.strict: bool | None = None  # nobody knows how an earlier loss left the network
         self.set_progress(0.0)
 
     def set_progress(self, fraction: float) -> None:
