@@ -1,4 +1,4 @@
-"""The paper's tables and figures, and ablations: every run they need, and what is missing yet.
+"""The paper's tables and figures, ablations, BabyAI: every run they need, and what is missing yet.
 
 python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 """
@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.data import babyai
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json
 
@@ -67,11 +68,14 @@ class Piece:
 
 def pieces(options: DictConfig) -> list[list[Piece]]:
     """Return the pieces of what is asked for: chains, each from one phase 1."""
-    if all(options[kind] is None for kind in ("table", "figure", "ablation")):
-        raise UserError("name a table=2, 3 or 4, a figure=5 or 6, of the paper, or ablation=all")
-    tables = options.table is not None or options.figure is not None
-    found = table_chains(options) if tables else []
-    return found + (ablation_chains(options) if options.ablation is not None else [])
+    asked = {kind for kind in ("table", "figure", "ablation", "level") if options[kind] is not None}
+    if not asked:
+        raise UserError(
+            "name a table=2, 3 or 4, a figure=5 or 6, of the paper, ablation=all or level=all"
+        )
+    found = table_chains(options) if asked & {"table", "figure"} else []
+    found += ablation_chains(options) if "ablation" in asked else []
+    return found + (level_chains(options) if "level" in asked else [])
 
 
 def table_chains(options: DictConfig) -> list[list[Piece]]:
@@ -121,6 +125,35 @@ def ablated(options: DictConfig, task: str, name: str, seed: int) -> Piece:
     parts = (task, given["demonstrations.n"], given["preset"], name, seed)
     file = result_file(options.ablations, *parts)
     return Piece(runs[name], tuple(f"{key}={value}" for key, value in given.items()), file)
+
+
+def level_chains(options: DictConfig) -> list[list[Piece]]:
+    """Return the pieces of the levels of BabyAI that are asked for, each by itself."""
+    section = options.options_of.level
+    names = section.names if options.level == "all" else [options.level]
+    for name in names:
+        babyai(name)  # refuses what is no level
+    return [
+        [leveled(options, name, n, seed)]
+        for seed, n, name in product(options.seeds, section.demonstrations, names)
+    ]
+
+
+def leveled(options: DictConfig, level: str, n: int, seed: int) -> Piece:
+    """Return the piece of one level and number of demonstrations."""
+    section = options.options_of.level.all
+    name = f"{level}-{n}-{section.preset}-seed{seed}"
+    given = {
+        "world": "babyai",
+        "level": level,
+        "seed": seed,
+        "demonstrations.n": n,
+        "run": f"levels-{name}",
+        "results": options.levels,
+        **flat(section),
+    }
+    file = result_file(options.levels, level, n, section.preset, None, seed)
+    return Piece(f"levels-{name}", tuple(f"{key}={value}" for key, value in given.items()), file)
 
 
 def wanted_phases(options: DictConfig) -> list[str]:

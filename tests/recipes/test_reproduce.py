@@ -80,6 +80,30 @@ def test_an_ablation_changes_one_thing_of_the_whole(options, tmp_path):
     assert after["suitability"]["served"]["rate"] == 1.0
 
 
+def test_levels_of_babyai_are_pieces_by_number_of_demonstrations(options, tmp_path):
+    from reproduce import pieces, reproduce
+
+    asked = options("level=all", "seeds=[0,1,2]")
+    found = [piece for (piece,) in pieces(asked)]
+    assert len({piece.file for piece in found}) == 3 * 2 * 3
+    assert found[1].file.as_posix() == "results/babyai/GoToLocal-1000-strong-seed0.json"
+
+    asked = options("level=GoToObj", f"levels={tmp_path / 'found'}")
+    asked.options_of.level.demonstrations = [40]
+    asked.options_of.level.all = {
+        "preset": "film",
+        "budget": "tiny",
+        "phase2": False,
+        "references": True,
+        "evaluate": {"episodes": 10, "states": 0},
+        "progress": False,
+    }
+    assert reproduce(asked) == []
+    ((piece,),) = pieces(asked)
+    assert piece.done and piece.file == tmp_path / "found" / "GoToObj-40-film-seed0.json"
+    assert {"phase1", "true_actions", "demonstrator"} <= set(read_json(piece.file)["results"])
+
+
 def test_a_piece_that_fails_ends_its_chain(options):
     from reproduce import reproduce
 
@@ -106,6 +130,7 @@ def test_listing_runs_nothing(options, capsys):
         (["table=2", "presets=[huge]"], "huge"),
         (["ablation=gravity"], "gravity"),
         (["ablation=all", "tasks=[pick]"], "move, pick-out alone"),
+        (["level=GoToMoon"], "no level 'BabyAI-GoToMoon-v0'"),
     ],
 )
 def test_what_cannot_be_reproduced_is_refused(options, given, said):
