@@ -95,6 +95,7 @@ def test_levels_of_babyai_are_pieces_by_number_of_demonstrations(options, tmp_pa
         "budget": "tiny",
         "phase2": False,
         "references": True,
+        "processes": 1,
         "evaluate": {"episodes": 10, "states": 0},
         "progress": False,
     }
