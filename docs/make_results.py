@@ -7,6 +7,7 @@ of ``README.md`` between its two marks. A test checks that both are up to date.
 import functools
 from collections.abc import Mapping
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -16,6 +17,7 @@ from ifo_grounding.report import (
     audit_figure,
     compared_rates,
     markdown_table,
+    rates_by_number,
     results_rows,
     save_figure,
 )
@@ -27,6 +29,7 @@ from ifo_grounding.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "assets" / "studies.png"
+LEARNED = PICTURE.with_name("babyai.png")
 HACKED = ROOT / "results" / "study" / "move-200-film-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
@@ -35,6 +38,12 @@ NAMES = {
     "phase2": "phase 2",
 }
 
+BABYAI_POLICIES = {
+    "bot": "demonstrator",
+    "true actions": "true_actions",
+    "phase 1": "phase1",
+    "phase 2": "phase2",
+}
 LEVELS = ("GoToObj", "GoToLocal", "PickupLoc")
 """Levels of BabyAI that the page speaks of, run or not, with 1,000 demonstrations at least."""
 
@@ -178,11 +187,16 @@ def imitation_section() -> list[str]:
     ]
 
 
-def babyai_section() -> list[str]:
-    """Return what was measured in the levels of BabyAI."""
-    ran = read_results(
+def levels() -> dict[tuple[str, int, str], list[dict[str, Any]]]:
+    """Return the committed seeds of each level of BabyAI, number of demonstrations and preset."""
+    return read_results(
         ROOT / "results" / "babyai", lambda o: (o["task"], o["demonstrations"]["n"], preset_of(o))
     )
+
+
+def babyai_section() -> list[str]:
+    """Return what was measured in the levels of BabyAI."""
+    ran = levels()
     known = {level for level, _, _ in ran}
     waiting = {(level, 1000, ""): [] for level in LEVELS if level not in known}
     order = [*LEVELS, *sorted(known.difference(LEVELS))]
@@ -192,7 +206,9 @@ def babyai_section() -> list[str]:
         "Greedy success by BabyAI's own reward in fixed rooms, in percent, with 95% intervals over"
         " seeds and rooms. [How it is set up](babyai.md). `true actions` imitates what the bot did"
         " in place of labels, which no learner may read: an upper reference for phase 1, as the bot"
-        " itself is.",
+        " itself is. Minutes are those of one core from recording to the end of the evaluation, the"
+        " median of the seeds.",
+        f"![Success against the number of demonstrations](assets/{LEARNED.name})",
         markdown_table([babyai_row(*level, runs) for level, runs in found]),
         *([commands_note(ran.values())] if ran else []),
     ]
@@ -202,20 +218,38 @@ def babyai_row(level: str, n: int, preset: str, runs: list[dict[str, Any]]) -> d
     """Compare both phases in one level with their references."""
     row: dict[str, Any] = {"level": level, "demonstrations": f"{n:,}", "preset": preset}
     row["seeds"] = len(runs)
-    columns = {
-        "bot": "demonstrator",
-        "true actions": "true_actions",
-        "phase 1": "phase1",
-        "phase 2": "phase2",
-    }
-    for title, name in columns.items():
-        known = runs and all(name in run["results"] for run in runs)
-        row[title] = brief(two_level_bootstrap(outcomes(runs, name))) if known else "not run"
+    measured = level_rates(runs)
+    for title in BABYAI_POLICIES:
+        row[title] = brief(measured[title]) if title in measured else "not run"
     row["gain, points"] = "not run"
     if row["phase 2"] != "not run":
         both = (outcomes(runs, name) for name in ("phase1", "phase2"))
         row["gain, points"] = brief(paired_difference(*both))
+    row["minutes"] = round(median(run["seconds"] for run in runs) / 60) if runs else "not run"
     return row
+
+
+def level_rates(runs: list[dict[str, Any]]) -> dict[str, Rate]:
+    """Return how often each policy that was run with every seed succeeds in a level."""
+    return {
+        title: two_level_bootstrap(outcomes(runs, name))
+        for title, name in BABYAI_POLICIES.items()
+        if runs and all(name in run["results"] for run in runs)
+    }
+
+
+def babyai_picture() -> Figure:
+    """Draw success against the number of demonstrations, of the preset `strong`."""
+    panels: dict[str, dict[str, dict[int, Rate]]] = {level: {} for level in LEVELS}
+    for (level, n, preset), runs in sorted(levels().items()):
+        if preset == "strong" and level in panels:
+            for title, rate in level_rates(runs).items():
+                panels[level].setdefault(title, {})[n] = rate
+    bots = {level: curves.pop("bot", {}) for level, curves in panels.items()}
+    return rates_by_number(
+        panels,
+        references={level: {"bot": max(bot.items())[1].rate} for level, bot in bots.items() if bot},
+    )
 
 
 def practised(variants: bool = False) -> dict[Key, list[dict[str, Any]]]:
@@ -329,6 +363,8 @@ def main() -> None:
             temporary.write_text(text)
     if studies():
         save_figure(study_picture(), PICTURE)
+    if levels():
+        save_figure(babyai_picture(), LEARNED)
     if (hacked := hacking_picture()) is not None:
         save_figure(hacked, PICTURE.with_name("hacking.png"))
 

@@ -15,6 +15,7 @@ from ifo_grounding.report import (
     confusion,
     figure_png,
     phase_bars,
+    rates_by_number,
     reliability_diagram,
     save_figure,
     success_over_iterations,
@@ -160,6 +161,20 @@ def test_reliability_diagram_shows_every_bin_with_its_interval_and_count():
     assert [text.get_text() for text in axes.texts] == ["1,000", "50"]
     with pytest.raises(UserError, match="at least one bin"):
         reliability_diagram([])
+
+
+def test_rates_by_number_shows_each_curve_in_its_panel():
+    few, many = wilson(60, 100), wilson(80, 100)
+    panels = {"move": {"phase 1": {500: few, 2000: many}, "phase 2": {2000: many}}, "pick": {}}
+    figure = rates_by_number(panels, references={"pick": {"the paper": 0.13}})
+    first, second = figure.axes
+    curve, _, (bars,) = first.containers[0]
+    assert curve.get_xydata().tolist() == [[500, 0.6], [2000, 0.8]]
+    assert bars.get_segments()[0][:, 1].tolist() == pytest.approx([few.low, few.high])
+    assert [label.get_text() for label in second.get_xticklabels()] == ["500", "2,000"]
+    assert second.lines[0].get_ydata() == [0.13, 0.13]
+    with pytest.raises(UserError, match="at least one curve"):
+        rates_by_number({"move": {"phase 1": {}}})
 
 
 def test_compared_rates_shows_each_interval_in_its_group():

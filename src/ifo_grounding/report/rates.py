@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.report.plots import _dress, _figure, _legend, _percent
+from ifo_grounding.report.plots import _dress, _figure, _percent
 from ifo_grounding.report.theme import LIGHT, PALETTE
 from ifo_grounding.stats import Rate
 
@@ -63,62 +66,73 @@ def compared_rates(groups: Mapping[str, Mapping[str, Rate]], *, title: str = "")
 
 
 def rates_by_number(
-    curves: Mapping[str, Mapping[int, Rate]],
+    panels: Mapping[str, Mapping[str, Mapping[int, Rate]]],
     *,
     x: str = "demonstrations",
-    references: Mapping[str, float] | None = None,
-    title: str = "",
+    references: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Figure:
-    """Draw rates against a number that grows by factors, with intervals.
+    """Draw rates against a number that grows by factors, with intervals, in panels side by side.
 
     Args:
-        curves: name of the curve -> {number: rate}.
+        panels: title of the panel -> {name of the curve: {number: rate}}.
         x: what the number counts.
-        references: name -> rate, drawn as a dashed line across.
-        title: above the plot.
+        references: title of the panel -> {name: rate}, each drawn as a dashed line across.
 
     >>> from ifo_grounding.stats import wilson
     >>> curves = {"phase 1": {500: wilson(60, 100), 2000: wilson(80, 100)}}
-    >>> rates_by_number(curves, references={"paper": 0.766}).axes[0].get_xscale()
+    >>> figure = rates_by_number({"move": curves}, references={"move": {"paper": 0.766}})
+    >>> figure.axes[0].get_xscale()
     'log'
     """
-    if not any(curves.values()):
+    names = list(dict.fromkeys(name for curves in panels.values() for name in curves))
+    every = [curve for curves in panels.values() for curve in curves.values()]
+    if not any(every):
         raise UserError("rates_by_number needs at least one curve with one rate")
-    figure, grid = _figure(6.4, 3.8)
-    axes = grid[0, 0]
-    _dress(axes, title, x)
-    axes.set_xscale("log")
-    for place, (name, curve) in enumerate(curves.items()):
-        colour = PALETTE[place % len(PALETTE)]
-        numbers = sorted(curve)
-        rates = [curve[number] for number in numbers]
-        axes.fill_between(
-            numbers,
-            [rate.low for rate in rates],
-            [rate.high for rate in rates],
-            color=colour,
-            alpha=0.18,
-            linewidth=0,
-        )
-        axes.plot(numbers, [r.rate for r in rates], color=colour, marker="o", ms=5, label=name)
-    for name, rate in (references or {}).items():
-        axes.axhline(rate, color=LIGHT["faint"], linestyle="--", linewidth=1.2)
-        axes.annotate(
-            name,
-            (1.0, rate),
-            (-4, 3),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            fontsize=9,
-            color=LIGHT["faint"],
-            ha="right",
-        )
-    numbers = sorted({number for curve in curves.values() for number in curve})
-    axes.set_xticks(numbers, [f"{number:,}" for number in numbers])
-    axes.minorticks_off()
-    _percent(axes)
-    _legend(axes, loc="lower right")
+    numbers = sorted({number for curve in every for number in curve})
+    low = min(rate.low for curve in every for rate in curve.values())
+    figure, grid = _figure(1.6 + 2.8 * len(panels), 3.4, columns=len(panels))
+    for axes, (title, curves) in zip(grid[0], panels.items(), strict=True):
+        _dress(axes, title, x)
+        axes.set_xscale("log")
+        for name, curve in curves.items():
+            place = names.index(name)
+            _curve(axes, name, curve, PALETTE[place % len(PALETTE)], 1 + 0.03 * place)
+        for name, rate in (references or {}).get(title, {}).items():
+            axes.axhline(rate, color=LIGHT["faint"], linestyle="--", linewidth=1.2, label=name)
+        axes.set_xticks(numbers, [f"{number:,}" for number in numbers])
+        axes.set_xlim(0.8 * numbers[0], 1.25 * numbers[-1])
+        axes.minorticks_off()
+        _percent(axes, max(0.0, 0.1 * math.floor(10 * low)))
+    shown: dict[str, Any] = {}
+    for axes in grid[0]:
+        handles, labels = axes.get_legend_handles_labels()
+        shown = dict(zip(labels, handles, strict=True)) | shown
+    figure.legend(
+        shown.values(),
+        shown.keys(),
+        loc="outside lower center",
+        ncols=len(shown),
+        frameon=False,
+        labelcolor=LIGHT["ink"],
+        fontsize=9,
+    )
     return figure
+
+
+def _curve(axes: Axes, name: str, curve: Mapping[int, Rate], colour: str, aside: float) -> None:
+    numbers = sorted(curve)
+    rates = [curve[number] for number in numbers]
+    axes.errorbar(
+        [aside * number for number in numbers],  # so that no interval hides another
+        [rate.rate for rate in rates],
+        yerr=[[r.rate - r.low for r in rates], [r.high - r.rate for r in rates]],
+        color=colour,
+        linewidth=1.8,
+        marker="o",
+        ms=5,
+        capsize=3,
+        label=name,
+    )
 
 
 def reliability_diagram(bins: Sequence[tuple[float, Rate]], *, title: str = "") -> Figure:
