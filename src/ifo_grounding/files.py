@@ -34,7 +34,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     The temporary path may be written as a file or made a folder. It is removed if the block raises.
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))  # what a link points to, not the link
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:

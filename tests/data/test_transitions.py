@@ -167,3 +167,19 @@ def test_nothing_kept_is_said():
     picks = [policy(env.reset())["action"].item() == 4 for policy in taken]
     with pytest.raises(UserError, match="none of 1 steps changed anything"):
         collect_transitions(env, 1, seed=picks.index(True), **always_pick)
+
+
+def test_folders_of_others_are_left_alone(tmp_path):
+    found = collect_transitions(make_env(), 60)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").touch()
+    with pytest.raises(UserError, match=r"mine holds 'thesis\.tex', which would be deleted"):
+        found.save(tmp_path / "mine")
+    with pytest.raises(UserError, match="is a file: name a folder"):
+        found.save(tmp_path / "mine" / "thesis.tex")
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "made")
+    (tmp_path / "made").mkdir()
+    for _ in range(2):  # an older one is replaced
+        found.save(link)
+    assert link.is_symlink() and len(Collected.load(tmp_path / "made").buffer) == len(found.buffer)

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv, check_env_specs
 
 from envs.dial import MARKS, PRESS, Dial
+from ifo_grounding.data import collect_transitions
 from ifo_grounding.envs import from_gymnasium
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, return_correlation, success_rate
@@ -215,7 +216,14 @@ class Odd(Dial):
         (Dial, {"vocabulary": Vocabulary(["turn", "the"])}, "unknown word 'dial'"),
         (Dial, {"num_envs": 0}, "num_envs"),
         (Dial, {"stop": 7}, "stop must be an action 0..2"),
+        (Dial, {"stop": 3}, "stop must be an action 0..2 or 'add', got 3"),
+        (Dial, {"stop": 2.0}, "stop must be a whole number, got 2.0"),
+        (Dial, {"stop": True}, "stop must be a whole number"),
         (Dial, {"stop": "press"}, "stop"),
+        (Dial, {"num_envs": 2.5}, "num_envs must be a whole number, got 2.5"),
+        (Dial, {"vocabulary": ["turn"]}, "vocabulary is a Vocabulary.*got list"),
+        (Dial(), {}, "its class, got Dial"),
+        (lambda: "dial", {}, "a world is a gymnasium.Env, got str"),
         (Dial, {"stream": "test"}, "stream"),
         (Dial, {"max_steps": 3}, "in your function"),
         (lambda: Odd(np.zeros((20, 28, 3))), {}, "bytes .* float64"),
@@ -230,6 +238,65 @@ class Odd(Dial):
 def test_worlds_that_do_not_fit_are_refused(make, options, said):
     with pytest.raises(UserError, match=said):
         from_gymnasium(make, **{"seed": 0, **DIAL, **options})
+
+
+def test_an_image_keeps_its_size():
+    world = Odd(np.zeros((20, 28, 3), np.uint8))
+    env = from_gymnasium(lambda: world, seed=0, **DIAL)
+    world.view = np.zeros((20, 30, 3), np.uint8)
+    with pytest.raises(UserError, match=r"was \[3, 20, 28\] and is now \[3, 20, 30\]"):
+        env.reset()
+
+
+@pytest.mark.parametrize("stop", [None, PRESS])
+@pytest.mark.parametrize("action", [-1, 3])
+def test_actions_that_the_world_has_not_are_refused(stop, action):
+    env = dials(2, stop=stop)
+    with pytest.raises(UserError, match=r"actions are 0\.\.2 here.*another world"):
+        env.step(env.reset().set("action", torch.tensor([0, action])))
+
+
+@pytest.mark.parametrize(("stop", "named"), [(None, None), (PRESS, PRESS), ("add", 3)])
+def test_it_says_which_action_is_the_stop(stop, named):
+    env = dials(20, stop=stop, instructed=False)
+    assert env.stop_action == named
+    buffer, report = collect_transitions(env, 300)
+    sample = buffer[:]
+    unchanged = (sample["pixels"] == sample["next", "pixels"]).flatten(1).all(1)
+    assert set(sample["action"][unchanged].tolist()) == ({named} if stop is not None else set())
+    # Pressing shows nothing: without a stop it cannot be told from a bump.
+    assert (report.kept[PRESS] > 0) == (named == PRESS)
+
+    judge = TensorDictModule(lambda pixels: torch.ones(len(pixels), 1), ["pixels"], ["goal_score"])
+    paid = TransformedEnv(env, LearnedReward(judge, "goal"))
+    if stop is None:
+        with pytest.raises(UserError, match="does not say which action is the stop"):
+            paid.rollout(2)
+        return
+    rollout = paid.rollout(20, break_when_any_done=False)
+    stopped = rollout["action"] == named
+    assert stopped.any() and torch.equal(rollout["next", "learned_reward"][..., 0] > 0, stopped)
+    assert torch.equal(rollout["next", "terminated"][..., 0], stopped)
+
+
+def test_arrival_is_paid_where_nobody_stops():
+    env = dials(6, instructed=False)
+    four = MARKS.index("four")
+
+    def there(pixels):
+        return 8.0 * (shown(pixels) == four).float().unsqueeze(-1) - 4.0
+
+    judge = TensorDictModule(there, ["pixels"], ["goal_score"])
+    paid = TransformedEnv(env, LearnedReward(judge, "goal", arrival=0.9))
+    check_env_specs(paid)
+    rollout = paid.rollout(60, break_when_any_done=False)
+    after = rollout["next"]
+    reached = shown(after["pixels"].flatten(0, 1)).view(6, 60) == four
+    assert reached.any() and not reached.all()
+    assert torch.equal(after["terminated"][..., 0], reached)
+    assert (after["done"] >= after["terminated"]).all()
+    sure = torch.tensor(4.0).sigmoid()
+    assert torch.allclose(after["learned_reward"][..., 0], reached * sure)
 
 
 @pytest.mark.parametrize("shape", [(20, 28), (1, 20, 28), (20, 28, 1), (3, 20, 28)])

@@ -59,7 +59,8 @@ def test_judges_say_what_the_learned_reward_pays(env):
     stopped = played.clone()
     stopped[keys.ACTION] = torch.full((steps,), keys.STOP)
     stopped[keys.NEXT, keys.PIXELS] = stopped[keys.PIXELS]
-    paid = LearnedReward(judges["goal"], "goal")(stopped)[keys.NEXT, keys.LEARNED_REWARD]
+    goal = LearnedReward(judges["goal"], "goal", stop_action=keys.STOP)
+    paid = goal(stopped)[keys.NEXT, keys.LEARNED_REWARD]
     np.testing.assert_allclose(trace.rewards["goal"], paid.flatten(), rtol=1e-4)
 
 

@@ -3,11 +3,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
-from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import RenameTransform, SerialEnv, StepCounter, TransformedEnv
 
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import Shapes, make_policy
+from ifo_grounding.networks import Shapes, make_inverse, make_policy
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 
 
@@ -31,6 +31,21 @@ INSTRUCTIONS = {
 @pytest.mark.parametrize("action", [Categorical(4, shape=(5,)), OneHot(4, shape=(5, 4))])
 def test_sizes_are_read_from_specs(instruction, action):
     assert Shapes.of(env(instruction, action)) == Shapes((3, 40, 56), 23, 12, 4)
+
+
+def test_networks_are_made_for_entries_of_other_names():
+    theirs = TransformedEnv(
+        PickAndPlaceEnv("move", num_envs=2, seed=0, tile_size=16),
+        RenameTransform(["pixels", "instruction"], ["camera", "words"], ["action"], ["move"]),
+    )
+    names = {"in_keys": ["camera", "words"], "action_key": "move"}
+    policy = make_policy(theirs, seed=0, **names)
+    assert policy.network_config.shapes == Shapes.of(PickAndPlaceEnv("move", tile_size=16))
+    assert theirs.rollout(3, policy, break_when_any_done=False)["move"].shape == (2, 3)
+    assert make_inverse(theirs, in_keys=["camera", ("next", "camera")]) is not None
+    one = env(INSTRUCTIONS["categorical"], Categorical(4, shape=(5,)))
+    one.full_action_spec = Composite(move=Categorical(7, shape=(5,)), shape=(5,))
+    assert Shapes.of(one).n_actions == 7
 
 
 def test_attributes_win_over_specs():

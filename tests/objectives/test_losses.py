@@ -79,6 +79,8 @@ def test_one_hot_and_categorical_are_never_confused():
         for wrong in (one_hot, torch.tensor([[1], [2]])):
             with pytest.raises(UserError, match="actions must have shape"):
                 loss(labelled([1, 2]).set("action", wrong))
+        with pytest.raises(UserError, match=r"action 3 is none of the network's 0\.\.2"):
+            loss(labelled([1, 3]))
     with pytest.raises(UserError, match="actions must have shape"):
         ImitationLoss(hot)(labelled([1, 2]))
 

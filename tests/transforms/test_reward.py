@@ -247,11 +247,27 @@ def test_beside_a_reward_sum():
         ({"goal_model": 0}, "goal_model is for kind='both'"),
         ({"kind": "goal", "form": "centred"}, "a goal pays a probability"),
         ({"weights": (1,)}, "weights are two"),
+        ({"stop_action": "last"}, "unknown stop_action 'last'"),
+        ({"arrival": 0.9}, "of the judge of goals.*kind='action'"),
+        ({"kind": "goal", "arrival": 1.5}, "within 0..1, got 1.5"),
     ],
 )
 def test_impossible_options(options, message):
     with pytest.raises(UserError, match=message):
         LearnedReward(action_judge(), **options)
+
+
+def test_who_knows_the_stop_is_asked():
+    world = CounterWorld((6,), max_steps=12)
+    reward = LearnedReward(goal_judge(), kind="goal")
+    with pytest.raises(UserError, match="the environment does not say which action is the stop"):
+        make(reward, world=world).rollout(3, expert)
+    world.stop_action = STOP
+    rollout = make(reward.clone(), world=world).rollout(30, expert, break_when_any_done=False)
+    stops = (rollout["action"] == STOP).float()
+    assert torch.allclose(rollout["next", "learned_reward"][..., 0], SURE * stops)
+    with pytest.raises(UserError, match=r"a batch does not say.*stop_action="):
+        LearnedReward(goal_judge(), kind="goal")(rollout)
 
 
 def test_missing_entries_are_named():

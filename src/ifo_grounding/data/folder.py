@@ -35,7 +35,11 @@ def save_folder(
         version: version of that format.
         arrays: tensors by name; each becomes ``name.npy``.
         facts: what else a reader needs.
+
+    Raises:
+        UserError: where the folder is a file, or holds what was not written by this function.
     """
+    _check_ours(Path(folder))
     with atomic_write(folder) as temporary:
         temporary.mkdir()
         listed = {}
@@ -51,6 +55,20 @@ def save_folder(
         write_json(
             temporary / META,
             {"format": kind, "version": version, "arrays": listed, "facts": dict(facts)},
+        )
+
+
+def _check_ours(folder: Path) -> None:
+    """Raise :class:`UserError` where writing ``folder`` would delete what others put there."""
+    if not folder.is_dir():
+        if folder.exists():
+            raise UserError(f"{folder} is a file: name a folder")
+        return
+    others = sorted(p.name for p in folder.iterdir() if p.name != META and p.suffix != ".npy")
+    if others:
+        raise UserError(
+            f"{folder} holds {others[0]!r}, which would be deleted: name another folder, or an "
+            "empty one"
         )
 
 

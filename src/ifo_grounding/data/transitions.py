@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ifo_grounding import keys
+from ifo_grounding.attributes import STOP_ACTION, attribute, says_stop
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import fact, load_folder, save_folder
@@ -36,7 +37,7 @@ class RandomActions(TensorDictModuleBase):
         env: environment with one categorical action.
         stop_probability: probability of ``stop_action``; the others share the rest evenly. By
             default all are equally likely.
-        stop_action: by default the last action.
+        stop_action: by default that of the environment, or the last action where it does not say.
         seed: of the actions.
 
     Raises:
@@ -62,16 +63,21 @@ class RandomActions(TensorDictModuleBase):
         self.in_keys: list[Any] = []
         self.out_keys = [env.action_key]
         self.shape, self.n_actions, self.device = spec.shape, int(spec.space.n), env.device
-        self.stop_action = self.n_actions - 1 if stop_action is None else stop_action
-        if not 0 <= self.stop_action < self.n_actions:
+        self.stop_action = self._stop(env) if stop_action is None else stop_action
+        if self.stop_action is not None and not 0 <= self.stop_action < self.n_actions:
             raise UserError(f"stop_action must be 0..{self.n_actions - 1}, got {stop_action}")
         self.probabilities = torch.full((self.n_actions,), 1 / self.n_actions)
         if stop_probability is not None:
             if not 0.0 <= stop_probability <= 1.0 or self.n_actions < 2:
                 raise UserError(f"stop_probability must be within 0..1, got {stop_probability}")
+            if self.stop_action is None:
+                raise UserError("stop_probability is for worlds with a stop, and this one has none")
             self.probabilities.fill_((1 - stop_probability) / (self.n_actions - 1))
             self.probabilities[self.stop_action] = stop_probability
         self.generator = seeded(seed, "random actions")
+
+    def _stop(self, env: EnvBase) -> int | None:
+        return attribute(env, STOP_ACTION) if says_stop(env) else self.n_actions - 1
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action into each row."""
@@ -181,7 +187,8 @@ def collect_transitions(
         n: steps to take, at least; all environments of the batch step together. The buffer holds
             fewer where unchanged ones are dropped.
         stop_probability: probability of the stop; by default all actions are equally likely.
-        stop_action: which action is the stop; by default the last one.
+        stop_action: which action is the stop; by default the environment's ``stop_action``, or the
+            last one where it has no such attribute. Where that is None, none is.
         drop_unchanged: whether to leave out unchanged transitions other than stops.
         seed: of the actions; scenes are drawn by the environment.
         progress: whether to show a bar.
@@ -198,7 +205,7 @@ def collect_transitions(
     if n < 1:
         raise UserError(f"n must be at least 1 step, got {n}")
     policy = RandomActions(env, stop_probability, stop_action, seed)
-    harvest = _Harvest(policy.n_actions, policy.stop_action if drop_unchanged else None)
+    harvest = _Harvest(policy.n_actions, policy.stop_action, drop_unchanged)
     batches = _collect(env, policy, n, progress)
     codec, codes = FrameCodec.compress(harvest.pieces(batches))
     if not len(codes):
@@ -213,7 +220,9 @@ class _Harvest:
 
     n_actions: int
     stop_action: int | None
-    """The action whose unchanged transitions are kept; None keeps those of all."""
+    """The action whose unchanged transitions are kept."""
+    drop_unchanged: bool
+    """Whether those of all others are dropped."""
     actions: list[Tensor] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -226,9 +235,10 @@ class _Harvest:
             action = batch[keys.ACTION].cpu()
             pixels, after = batch[keys.PIXELS].cpu(), batch[keys.NEXT, keys.PIXELS].cpu()
             self.taken += action.bincount(minlength=self.n_actions)
-            if self.stop_action is not None:
-                changed = (pixels != after).flatten(1).any(1)
-                keep = changed | (action == self.stop_action)
+            if self.drop_unchanged:
+                keep = (pixels != after).flatten(1).any(1)
+                if self.stop_action is not None:
+                    keep |= action == self.stop_action
                 action, pixels, after = action[keep], pixels[keep], after[keep]
             self.kept += action.bincount(minlength=self.n_actions)
             self.actions.append(action)

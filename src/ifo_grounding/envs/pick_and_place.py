@@ -62,6 +62,9 @@ class PickAndPlaceEnv(EnvBase):
     (torch.Size([4, 40, 3, 48, 48]), torch.Size([4, 40, 1]))
     """
 
+    stop_action = keys.STOP
+    """The action by which a policy ends an episode."""
+
     def __init__(
         self,
         task: str = "move",

@@ -61,11 +61,12 @@ def from_gymnasium(
         instructed: whether episodes show their instruction and pay their reward. Without, only
             images are read, and an episode that the world ends counts as truncated: what the world
             was asked for is no business of a learner.
-        stop: how a policy says that it is done, in a world where episodes do not end by an action.
-            The number of an action that does nothing there, such as MiniGrid's ``done`` (6), or
-            ``"add"`` for one more action that never reaches the world. It terminates the episode;
-            close the demonstrations with
-            :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match.
+        stop: how a policy says that it is done: the number of the action that ends an episode; or,
+            where none does, of one that does nothing, such as MiniGrid's ``done`` (6), or ``"add"``
+            for one more action that never reaches the world. It terminates the episode, and is the
+            environment's ``stop_action``; close the demonstrations with
+            :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match. None: nothing that
+            a policy does ends an episode as far as a learner is told.
         skip_unknown: whether words that the vocabulary does not hold are left out of instructions;
             otherwise they are refused.
         processes: whether every world runs in a process of its own.
@@ -120,6 +121,13 @@ def world_seed(seed: int, stream: str, number: int) -> int:
     return derive(seed, stream, number) % 2**31
 
 
+def whole(name: str, value: Any) -> int:
+    """Return a whole number, or refuse what is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise UserError(f"{name} must be a whole number, got {value!r}")
+    return int(value)
+
+
 class Reading:
     """Reads image and instruction out of what a world shows.
 
@@ -143,6 +151,13 @@ class Reading:
     ) -> None:
         if isinstance(stop, str):
             check_choice("stop", stop, (ADD,))
+        elif stop is not None:
+            stop = whole("stop", stop)
+        if not isinstance(vocabulary, Vocabulary):
+            raise UserError(
+                "vocabulary is a Vocabulary, such as that of the demonstrations or "
+                f"Vocabulary.from_sentences(...), got {type(vocabulary).__name__}"
+            )
         self.vocabulary, self.image = vocabulary, image
         self.instruction, self.instructed, self.stop = instruction, instructed, stop
         self.skip_unknown = skip_unknown
@@ -192,6 +207,8 @@ class Read(gymnasium.Wrapper):
     """
 
     def __init__(self, env: gymnasium.Env, reading: Reading) -> None:
+        if not isinstance(env, gymnasium.Env):
+            raise UserError(f"a world is a gymnasium.Env, got {type(env).__name__}")
         super().__init__(env)
         if not isinstance(env.action_space, gymnasium.spaces.Discrete) or env.action_space.start:
             raise UserError(
@@ -201,13 +218,16 @@ class Read(gymnasium.Wrapper):
         self.reading = reading
         count = int(env.action_space.n)
         added = reading.stop == ADD
+        if not (added or reading.stop is None or reading.stop in range(count)):
+            raise UserError(
+                f"stop must be an action 0..{count - 1} or {ADD!r}, got {reading.stop!r}"
+            )
         self.stop = count if added else reading.stop
-        if self.stop is not None and not 0 <= int(self.stop) <= count:
-            raise UserError(f"stop must be an action 0..{count - 1} or {ADD!r}, got {self.stop}")
         self.action_space = gymnasium.spaces.Discrete(count + added)
-        self._reaches = range(count)
+        self._added = count if added else None
         observation, info = env.reset(seed=0)
         pixels = reading.pixels(observation)
+        self._shape = pixels.shape
         spaces: dict[str, gymnasium.Space] = {
             keys.PIXELS: gymnasium.spaces.Box(0, 255, pixels.shape, np.uint8),
             ENDED: gymnasium.spaces.MultiBinary(3),
@@ -233,7 +253,7 @@ class Read(gymnasium.Wrapper):
         if self._last[ENDED].any():
             return self._last, 0.0, False, False, {}
         stopped = int(action) == self.stop
-        if int(action) not in self._reaches:
+        if int(action) == self._added:
             self._last = {**self._last, ENDED: np.array([0, 0, 1], dtype=np.int8)}
             return self._last, 0.0, False, False, {}
         observation, reward, terminated, truncated, _ = self.env.step(int(action))
@@ -247,6 +267,11 @@ class Read(gymnasium.Wrapper):
 
     def _seen(self, observation: Any, *ended: bool) -> dict[str, np.ndarray]:
         pixels = self.reading.pixels(observation)
+        if pixels.shape != self._shape:
+            raise UserError(
+                f"the image was {list(self._shape)} and is now {list(pixels.shape)}: wrap the "
+                "world so that its size stays"
+            )
         seen = {keys.PIXELS: pixels, ENDED: np.array(ended, dtype=np.int8)}
         return {**seen, keys.INSTRUCTION: self._tokens} if self.reading.instructed else seen
 
@@ -276,8 +301,13 @@ class GymnasiumEnv(EnvBase):
         device: torch.device | str | None = None,
     ) -> None:
         check_choice("stream", stream, STREAMS)
-        if num_envs < 1:
+        if whole("num_envs", num_envs) < 1:
             raise UserError(f"num_envs must be at least 1, got {num_envs}")
+        if not callable(make):
+            raise UserError(
+                "a world is an id or a function that makes it, such as its class, got "
+                f"{type(make).__name__}"
+            )
         super().__init__(device=device or "cpu", batch_size=[num_envs])
         vector = AsyncVectorEnv if processes else SyncVectorEnv
         makes = [lambda: Read(make(), reading)] * num_envs
@@ -289,6 +319,8 @@ class GymnasiumEnv(EnvBase):
         self._numbers = torch.full((num_envs,), -1)
         self._set_seed(seed)
         self._make_specs()
+        self.stop_action = self.n_actions - 1 if reading.stop == ADD else reading.stop
+        """The action by which a policy ends an episode, or None."""
 
     @property
     def scene_numbers(self) -> Tensor:
@@ -309,8 +341,8 @@ class GymnasiumEnv(EnvBase):
                 device=device,
             )
         self.observation_spec = observation
-        actions = int(self.worlds.single_action_space.n)  # type: ignore[attr-defined]
-        self.action_spec = Categorical(actions, shape=batch, device=device)
+        self.n_actions = int(self.worlds.single_action_space.n)  # type: ignore[attr-defined]
+        self.action_spec = Categorical(self.n_actions, shape=batch, device=device)
         self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
         flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
@@ -341,6 +373,11 @@ class GymnasiumEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get(keys.ACTION).cpu().numpy()
+        if not 0 <= actions.min() <= actions.max() < self.n_actions:
+            raise UserError(
+                f"actions are 0..{self.n_actions - 1} here, got {actions.min()}..{actions.max()}: "
+                "was the policy made for another world?"
+            )
         self._seen, reward, *_ = self.worlds.step(actions)
         terminated, truncated, stopped = self._seen[ENDED].astype(bool).T
         done = terminated | truncated | stopped

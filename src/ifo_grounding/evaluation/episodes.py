@@ -233,8 +233,9 @@ def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
         )
     if keys.INSTRUCTION not in env.observation_spec.keys(True, True):
         raise UserError(
-            "success needs an instructed environment: make it with instructed=True, or pass the "
-            "name of a task"
+            "success needs an environment that shows its instruction under "
+            f"{keys.INSTRUCTION!r}: make it with instructed=True, or rename its entry with "
+            "torchrl.envs.RenameTransform"
         )
 
 

@@ -34,8 +34,12 @@ class Blueprint:
 def blueprint(
     kind: str, source: Any, preset: str, options: dict[str, Any], overrides: dict[str, Any]
 ) -> Blueprint:
-    """Settle the sizes and choices of a network."""
-    shapes = Shapes.of(source)
+    """Settle the sizes and choices of a network, from the entries that it is to read."""
+    image, words = (1, 2) if kind == "goal" else (0, 1)
+    shown = getattr(source, "observation_spec", None)
+    leaves = set() if shown is None else set(shown.keys(True, True))
+    asked = {"pixels": options["in_keys"][image], "instruction": options["in_keys"][words]}
+    shapes = Shapes.of(source, **{name: key for name, key in asked.items() if key in leaves})
     config = NetworkConfig.of(kind, preset, **overrides)
     return Blueprint(kind, shapes, replace(config, patch_size=patch_size(shapes, config)), options)
 

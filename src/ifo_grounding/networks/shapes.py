@@ -9,6 +9,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Unbounded
 
 from ifo_grounding import keys
+from ifo_grounding.attributes import attribute
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import NetworkConfig
 
@@ -58,7 +59,7 @@ n_actions=6, tile_size=None)
                 of this class win over an env's specs.
             pixels: where an env's spec describes images.
             instruction: where an env's spec describes instructions.
-            action: where an env's spec describes actions.
+            action: where an env's spec describes actions; an env's only action has any name.
 
         Raises:
             UserError: where a size can be read from neither an attribute nor a spec.
@@ -66,7 +67,7 @@ n_actions=6, tile_size=None)
         if isinstance(source, cls):
             return source
         observations = getattr(source, "observation_spec", None)
-        found = {name: _attribute(source, name) for name in cls.__dataclass_fields__}
+        found = {name: attribute(source, name) for name in cls.__dataclass_fields__}
         if observations is not None:
             for name, value in _from_specs(source, observations, pixels, instruction, action):
                 found[name] = value if found[name] is None else found[name]
@@ -85,20 +86,6 @@ def patch_size(shapes: Shapes, config: NetworkConfig) -> int:
     return config.patch_size or shapes.tile_size or 8
 
 
-def _attribute(source: Any, name: str) -> Any:
-    """Return a plain attribute; a vector env that answers per worker must agree with itself."""
-    try:
-        value = getattr(source, name, None)
-        answers = list(value) if isinstance(value, (list, tuple)) else [value]
-    except Exception:  # a closed or remote env may fail in many ways; its specs then speak
-        return None
-    if name == "image_shape":
-        return tuple(answers) if len(answers) == 3 else None
-    answer = answers[0] if answers else None
-    same = all(other == answer for other in answers)
-    return answer if same and isinstance(answer, int) else None
-
-
 def _from_specs(
     env: Any, observations: Any, pixels: NestedKey, instruction: NestedKey, action: NestedKey
 ) -> list[tuple[str, Any]]:
@@ -111,8 +98,10 @@ def _from_specs(
         found.append(("instruction_length", int(spec.shape[-1])))
         found.append(("vocabulary_size", _count(spec)))
     actions = getattr(env, "full_action_spec", None)
-    if actions is not None and action in actions.keys(True, True):
-        found.append(("n_actions", _count(actions[action])))
+    if actions is not None:
+        names = list(actions.keys(True, True))
+        if action in names or len(names) == 1:
+            found.append(("n_actions", _count(actions[action if action in names else names[0]])))
     return found
 
 

@@ -111,10 +111,19 @@ def scalars(**values: Tensor) -> TensorDict:
     return TensorDict(dict(values), [])
 
 
-def check_action(action: Tensor, expected: tuple[int, ...]) -> None:
-    """Raise :class:`UserError` unless ``action`` has the shape that the network acts in."""
+def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = None) -> None:
+    """Raise :class:`UserError` unless ``action`` has the shape that the network acts in.
+
+    Where ``count`` actions are known, indices have to be of them; on a CPU, for elsewhere to look
+    is to wait.
+    """
     if tuple(action.shape) != tuple(expected):
         raise UserError(
             f"actions must have shape {list(expected)}, got {list(action.shape)}: indices have no "
             "trailing dim, and one-hot actions fit a one-hot policy alone"
+        )
+    if count is not None and action.device.type == "cpu" and int(action.max()) >= count:
+        raise UserError(
+            f"action {int(action.max())} is none of the network's 0..{count - 1}: make the network "
+            "for the environment whose actions these are"
         )

@@ -8,6 +8,7 @@ from typing import Any
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
+from torch.distributions import Categorical
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
@@ -89,7 +90,8 @@ class ImitationLoss(SupervisedLoss):
         with self._mode():
             dist = self.network.get_dist(tensordict.select(*self.network.in_keys))
         likeliest = dist.mode
-        check_action(action, likeliest.shape)
+        count = dist.logits.shape[-1] if isinstance(dist, Categorical) else None
+        check_action(action, likeliest.shape, count)
         loss = -dist.log_prob(action)
         right = (likeliest == action).reshape(*loss.shape, -1).all(-1)
         charged = take_charge(self.network)

@@ -51,7 +51,7 @@ class InverseLoss(SupervisedLoss):
         with self._mode():
             out = self.network(tensordict.select(*self.network.in_keys))
         logits = out.get(self.network.out_keys[0])
-        check_action(action, logits.shape[:-1])
+        check_action(action, logits.shape[:-1], logits.shape[-1])
         action = action.long()
         loss = F.cross_entropy(
             logits.reshape(-1, logits.shape[-1]), action.reshape(-1), reduction="none"

@@ -10,7 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase, Transform
 
+from ifo_grounding.attributes import stop_of
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.keys import (
     ACTION,
@@ -20,7 +22,6 @@ from ifo_grounding.keys import (
     LEARNED_REWARD,
     NEXT,
     PIXELS,
-    STOP,
 )
 from ifo_grounding.modules import device_of, evaluating
 from ifo_grounding.transforms._common import (
@@ -29,6 +30,7 @@ from ifo_grounding.transforms._common import (
     logit_key,
 )
 
+FROM_ENV = "env"
 KINDS = ("action", "goal", "both")
 FORMS = ("probability", "centred", "log-odds")
 ROWS_AT_ONCE = 4096
@@ -56,14 +58,19 @@ class LearnedReward(EpisodeTransform):
             ``log-odds`` log(p / (1 - p)).
         goal_model: the judge of goals where ``kind="both"``.
         weights: of the action's and of the goal's reward.
-        stop_action: the action that ends an episode by the policy's will; None pays the goal where
-            ``("next", "terminated")`` is true instead.
+        stop_action: the action that ends an episode by the policy's will, at which a goal is paid;
+            by default what the environment names as its ``stop_action`` (:meth:`ask` it, for
+            batches that were collected there). None pays the goal where ``("next", "terminated")``
+            is true.
+        arrival: for worlds without a stop: a goal is paid at the first step after which its judge's
+            probability is at least this, and on an environment the episode terminates there.
         pixels_key: key of the image, which the judge of goals is shown as it is after the step.
         initial_pixels_key: key of the first image of the episode, which the transform carries.
         action_key: key of the action.
 
     Raises:
-        UserError: on an unknown kind or form, or a judge of another form.
+        UserError: on an unknown kind or form, or a judge of another form; where goals are to be
+            paid and nobody says which action is the stop.
 
     >>> from tensordict.nn import TensorDictModule
     >>> model = TensorDictModule(lambda action: (action * 0.0).unsqueeze(-1), ["action"],
@@ -81,7 +88,8 @@ class LearnedReward(EpisodeTransform):
         form: str = "probability",
         goal_model: TensorDictModuleBase | None = None,
         weights: Sequence[float] = (1.0, 1.0),
-        stop_action: int | None = STOP,
+        stop_action: int | str | None = FROM_ENV,
+        arrival: float | None = None,
         pixels_key: NestedKey = PIXELS,
         initial_pixels_key: NestedKey = INITIAL_PIXELS,
         action_key: NestedKey = ACTION,
@@ -94,7 +102,14 @@ class LearnedReward(EpisodeTransform):
             raise UserError(f"form={form!r} is for the action's reward: a goal pays a probability")
         if len(weights) != 2:
             raise UserError(f"weights are two, of the action and of the goal, got {len(weights)}")
-        self.kind, self.form, self.stop_action = kind, form, stop_action
+        if isinstance(stop_action, str):
+            check_choice("stop_action", stop_action, (FROM_ENV,))
+        if arrival is not None and (kind == "action" or not 0.0 < arrival <= 1.0):
+            raise UserError(
+                f"arrival is a probability of the judge of goals, within 0..1, got {arrival} with "
+                f"kind={kind!r}"
+            )
+        self.kind, self.form, self.stop_action, self.arrival = kind, form, stop_action, arrival
         self.action_weight, self.goal_weight = (float(weight) for weight in weights)
         action_judge = None if kind == "goal" else model
         goal_judge = model if kind == "goal" else goal_model
@@ -111,11 +126,24 @@ class LearnedReward(EpisodeTransform):
             inputs += [unravel_key(key) for key in goal_judge.in_keys]
         super().__init__(in_keys=list(dict.fromkeys(inputs)), out_keys=[self.reward_key])
         self.action_judge, self.goal_judge = action_judge, goal_judge
+        self._named: int | None = None
+        """The stop of the environment, once it was asked for."""
 
     @property
     def judges_goals(self) -> bool:
         """Whether the first image of the episode is carried along."""
         return self.goal_judge is not None
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Belong to an environment, which is asked for its stop when it is needed."""
+        self._named = None
+        super().set_container(container)
+
+    def ask(self, env: EnvBase) -> LearnedReward:
+        """Ask an environment for its stop where that matters, to pay batches collected there."""
+        if self.judges_goals and self.stop_action == FROM_ENV and self.arrival is None:
+            self._named = stop_of(env, type(self).__name__)
+        return self
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -130,7 +158,12 @@ class LearnedReward(EpisodeTransform):
         if self.judges_goals:
             first = tensordict.get(self.initial_pixels_key)
             next_tensordict.set(self.initial_pixels_key, first)
-        return next_tensordict.set(self.reward_key, self._pay(tensordict, next_tensordict))
+        reward, arrived = self._pay(tensordict, next_tensordict)
+        if self.arrival is not None:
+            for name in ("done", "terminated"):
+                flag = next_tensordict.get(name)
+                next_tensordict.set(name, flag | arrived.view_as(flag))
+        return next_tensordict.set(self.reward_key, reward)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabel collected steps, a tensordict [*B], with ``("next", "learned_reward")``.
@@ -141,43 +174,65 @@ class LearnedReward(EpisodeTransform):
         if tensordict.get(NEXT, None) is None:
             tensordict.set(NEXT, tensordict.empty())
         after = tensordict.get(NEXT)
-        after.set(self.reward_key, self._pay(tensordict, after))
+        after.set(self.reward_key, self._pay(tensordict, after)[0])
         return tensordict
 
-    def _pay(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
-        """Reward of steps, float32 [*B, 1]."""
+    def _pay(self, before: TensorDictBase, after: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Reward of steps, float32 [*B, 1], and which of them are paid for their goal, [*B, 1]."""
         batch = before.batch_size
         rows = batch.numel()
         reward: Tensor | float = 0.0
+        reached = torch.zeros(rows, dtype=torch.bool)
         if self.action_judge is not None:
             entries = {key: self._rows(before, key) for key in self.action_judge.in_keys}
             logit = self._score(self.action_judge, self.action_logit, entries, rows)
             reward = reward + self.action_weight * formed(logit, self.form)
         if self.goal_judge is not None:
-            reward = reward + self.goal_weight * self._goal_reward(before, after, rows)
+            goal, reached = self._goal_reward(before, after, rows)
+            reward = reward + self.goal_weight * goal
         assert isinstance(reward, Tensor)
-        return reward.view(*batch, 1)
+        return reward.view(*batch, 1), reached.view(*batch, 1)
 
-    def _goal_reward(self, before: TensorDictBase, after: TensorDictBase, rows: int) -> Tensor:
+    def _goal_reward(
+        self, before: TensorDictBase, after: TensorDictBase, rows: int
+    ) -> tuple[Tensor, Tensor]:
+        """What the judge of goals pays [rows], and where it does, bool [rows]."""
         assert self.goal_judge is not None
-        stopped = self._stopped(before, after, rows).nonzero().squeeze(-1)
+        judged = self._judged(before, after, rows)
+        asked = judged.nonzero().squeeze(-1)
         entries = {
-            key: self._rows(after if unravel_key(key) == self.pixels_key else before, key)[stopped]
+            key: self._rows(after if unravel_key(key) == self.pixels_key else before, key)[asked]
             for key in self.goal_judge.in_keys
         }
-        reward = torch.zeros(rows, device=stopped.device)
-        if len(stopped):
-            logit = self._score(self.goal_judge, self.goal_logit, entries, len(stopped))
-            reward[stopped] = logit.sigmoid()
-        return reward
+        reward = torch.zeros(rows, device=judged.device)
+        if len(asked):
+            logit = self._score(self.goal_judge, self.goal_logit, entries, len(asked))
+            reward[asked] = logit.sigmoid()
+        if self.arrival is not None:
+            judged = reward >= self.arrival
+            reward = reward.where(judged, 0.0)
+        return reward, judged
 
-    def _stopped(self, before: TensorDictBase, after: TensorDictBase, rows: int) -> Tensor:
+    def _judged(self, before: TensorDictBase, after: TensorDictBase, rows: int) -> Tensor:
+        """After which steps the judge of goals is asked, bool [rows]."""
+        if self.arrival is not None:
+            return torch.ones(
+                rows, dtype=torch.bool, device=self._rows(after, self.pixels_key).device
+            )
         if self.stop_action is None:
             return self._rows(after, "terminated").reshape(rows).bool()
         action = self._rows(before, self.action_key)
         if action.ndim > 1 and action.shape[-1] > 1:
             action = action.argmax(-1)
-        return action.reshape(rows) == self.stop_action
+        return action.reshape(rows) == self._stop
+
+    @property
+    def _stop(self) -> int:
+        if isinstance(self.stop_action, int):
+            return self.stop_action
+        if self._named is None:
+            self._named = stop_of(self.parent if self.container else None, type(self).__name__)
+        return self._named
 
     def _rows(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         value = tensordict.get(key, None)
