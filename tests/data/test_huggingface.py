@@ -69,6 +69,35 @@ def test_arrays_and_grey_pictures_are_read():
     assert np.array_equal(all_frames(demos)[:2, 1], frames[:, 0])
 
 
+@pytest.mark.parametrize(
+    "feature",
+    [
+        datasets.Array4D((None, 3, 16, 24), "uint8"),
+        datasets.List(datasets.Array3D((3, 16, 24), "uint8")),
+        datasets.List(datasets.List(datasets.List(datasets.List(datasets.Value("uint8"))))),
+    ],
+)
+def test_columns_of_arrays_stay_bytes(feature):
+    frames = np.arange(2 * 3 * 16 * 24, dtype=np.uint8).reshape(2, 3, 16, 24)
+    features = datasets.Features({"frames": feature, "instruction": datasets.Value("string")})
+    rows = [{"frames": frames, "instruction": "go"}, {"frames": frames[::-1], "instruction": "up"}]
+    dataset = datasets.Dataset.from_list(rows, features=features)
+    for read in (dataset, dataset.to_iterable_dataset()):
+        demos = from_huggingface(read, close=False)
+        assert np.array_equal(all_frames(demos), np.concatenate([frames, frames[::-1]]))
+        assert demos.sentences() == ["go", "up"]
+    rows[1]["frames"] = None
+    with pytest.raises(UserError, match="episode 1 has no frames"):
+        from_huggingface(datasets.Dataset.from_list(rows, features=features))
+
+
+def test_integers_that_are_no_bytes_are_refused():
+    frames = np.full((2, 3, 16, 24), 300)
+    dataset = datasets.Dataset.from_list([{"frames": frames, "instruction": "go"}])
+    with pytest.raises(UserError, match=r"episode 0 is torch\.int64"):
+        from_huggingface(dataset)
+
+
 GOOD = {"frames": [Image.new("RGB", (24, 16), c) for c in ("red", "blue")], "instruction": "go"}
 
 
@@ -87,6 +116,16 @@ GOOD = {"frames": [Image.new("RGB", (24, 16), c) for c in ("red", "blue")], "ins
         ),
         ([GOOD, GOOD | {"frames": [Image.new("F", (24, 16))] * 2}], "episode 1: frame 0 .* 'F'"),
         ([GOOD, GOOD | {"frames": [{"bytes": b"?"}] * 2}], "episode 1: frame 0 cannot be read"),
+        ([GOOD, GOOD | {"frames": None}], "episode 1 has no frames"),
+        ([GOOD, GOOD | {"frames": [GOOD["frames"][0], None]}], "1: frame 1 is None, not a picture"),
+        ([GOOD | {"frames": [None, GOOD["frames"][0]]}], "0: frame 0 is None, not a picture"),
+        (
+            [GOOD, GOOD | {"frames": [{"bytes": None, "path": None}] * 2}],
+            "episode 1: frame 0 has neither bytes nor a path",
+        ),
+        ([GOOD | {"frames": [{"bytes": "text"}] * 2}], "episode 0: frame 0 cannot be read"),
+        ([GOOD | {"frames": GOOD["frames"][0]}], "episode 0 is a single picture, .*: group"),
+        ([GOOD | {"frames": {"bytes": b"", "path": None}}], "episode 0 is a single picture"),
         (datasets.Dataset.from_dict({"video": [1]}), "no column 'frames', but video: name it with"),
     ],
 )
@@ -95,8 +134,9 @@ def test_what_is_wrong_is_said_with_the_number_of_the_row(dataset, said):
         from_huggingface(dataset)
 
 
-def test_a_picture_that_datasets_cannot_decode_names_its_row(tmp_path):
-    rows = [GOOD, GOOD, GOOD | {"frames": [{"bytes": b"no picture", "path": None}] * 2}]
+@pytest.mark.parametrize("content", [b"no picture", None])
+def test_a_picture_that_datasets_cannot_decode_names_its_row(content):
+    rows = [GOOD, GOOD, GOOD | {"frames": [{"bytes": content, "path": None}] * 2}]
     features = {
         "frames": datasets.Sequence(datasets.Image()),
         "instruction": datasets.Value("string"),

@@ -151,6 +151,19 @@ def test_a_saved_report_makes_the_buffer_again(tmp_path, inverse):
         LabelReport.load(tmp_path / "labels")
 
 
+@pytest.mark.parametrize(("n_actions", "dtype"), [(256, torch.uint8), (300, torch.int32)])
+def test_labels_fit_any_number_of_actions(tmp_path, n_actions, dtype):
+    demos = record_demonstrations("move", 3)
+    last = torch.arange(n_actions) == n_actions - 1
+    sure = TensorDictModule(lambda x: last.float().expand(len(x), -1), ["pixels"], ["logits"])
+    buffer, report = label_demonstrations(demos, sure, device="cpu", progress=False)
+    assert report.actions.dtype == dtype
+    assert report.counts[-1] == demos.transitions
+    assert (buffer[:]["action"] == n_actions - 1).all()
+    report.save(tmp_path / "labels")
+    assert torch.equal(LabelReport.load(tmp_path / "labels").actions, report.actions)
+
+
 def test_bad_input_is_refused(inverse):
     demos = record_demonstrations("move", 5)
     with pytest.raises(UserError, match="batch_size must be"):

@@ -181,9 +181,35 @@ def test_damaged_and_missing_datasets_are_refused(folder):
         from_minari(dataset, image="view")
 
 
+class Interrupted(Demonstrations):
+    """Demonstrations whose reader presses Ctrl-C at number 3."""
+
+    def __getitem__(self, which):
+        if which == 3:
+            self.listed = minari.list_local_datasets()
+            raise KeyboardInterrupt
+        return super().__getitem__(which)
+
+
+def test_a_dataset_appears_when_everything_is_written(demos, folder):
+    parts = demos.codec, demos.codes, demos.lengths, demos.tokens
+    broken = Interrupted(*parts, vocabulary=VOCABULARY)
+    with pytest.raises(KeyboardInterrupt):
+        to_minari(broken, "mine/move-v0")
+    assert broken.listed == {}
+    assert [path.name for path in (folder / "mine").iterdir()] == ["namespace_metadata.json"]
+    to_minari(demos, "mine/move-v0", data_format="arrow", author="me")
+    assert list(minari.list_local_datasets()) == ["mine/move-v0"]
+    dataset = minari.load_dataset("mine/move-v0")
+    assert dataset.total_episodes == 12 and dataset.storage.metadata["author"] == {"me"}
+
+
 def test_nothing_half_written_stays_behind(demos, folder):
-    with pytest.raises(UserError, match=r"'no name' cannot be written: Malformed"):
-        to_minari(demos, "no name")
+    for name in ("no name", "../move-v0", "move"):
+        with pytest.raises(UserError, match=rf"'{name}' is no id of a dataset: it has to be"):
+            to_minari(demos, name)
+    with pytest.raises(UserError, match=r"'move-v0' cannot be written: No storage .* for csv"):
+        to_minari(demos, "move-v0", data_format="csv")
     with pytest.raises(TypeError, match="colour"):
         to_minari(demos, "move-v0", colour="red")
     assert not any(folder.iterdir())

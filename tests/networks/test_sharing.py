@@ -1,10 +1,12 @@
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.files import write_json
 from ifo_grounding.networks import (
     Shapes,
     from_pretrained,
@@ -12,7 +14,7 @@ from ifo_grounding.networks import (
     make_policy,
     save_pretrained,
 )
-from ifo_grounding.tasks import VOCABULARY
+from ifo_grounding.tasks import VOCABULARY, Vocabulary
 from networks.conftest import MAKERS
 
 SHAPES = Shapes(image_shape=(3, 16, 16), vocabulary_size=len(VOCABULARY))
@@ -39,7 +41,69 @@ def test_the_card_says_what_the_network_is(tmp_path):
     assert from_pretrained(tmp_path / "mine").vocabulary is None
 
 
-def test_a_folder_is_replaced_as_a_whole(tmp_path):
+def test_words_are_kept_when_a_network_is_saved_again(tmp_path):
+    save_pretrained(make_policy(SHAPES), tmp_path / "mine", vocabulary=VOCABULARY)
+    save_pretrained(from_pretrained(tmp_path / "mine"), tmp_path / "again")
+    assert from_pretrained(tmp_path / "again").vocabulary == VOCABULARY
+    fewer = Vocabulary(VOCABULARY.words[:5])
+    save_pretrained(from_pretrained(tmp_path / "mine"), tmp_path / "again", vocabulary=fewer)
+    assert from_pretrained(tmp_path / "again").vocabulary == fewer
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (Vocabulary([*VOCABULARY.words, "fly"]), "has 49 token ids .* built for 48 and 16"),
+        (Vocabulary(VOCABULARY.words, length=9), "and 9 per instruction, .* for 48 and 16"),
+    ],
+)
+def test_words_that_do_not_fit_are_refused(tmp_path, words, said):
+    with pytest.raises(UserError, match=f"the vocabulary .*{said}"):
+        save_pretrained(make_policy(SHAPES), tmp_path / "mine", vocabulary=words)
+    assert not list(tmp_path.iterdir())
+    save_pretrained(make_policy(SHAPES), tmp_path / "mine")
+    content = {"words": words.words, "length": words.length}
+    write_json(tmp_path / "mine" / "vocabulary.json", content)
+    with pytest.raises(UserError, match=rf"vocabulary\.json .*{said}"):
+        from_pretrained(tmp_path / "mine")
+
+
+@pytest.mark.parametrize("content", [[1], {}, None, {"words": [1], "length": 16}, {"words": 3}])
+def test_damaged_words_are_refused(tmp_path, content):
+    save_pretrained(make_policy(SHAPES), tmp_path / "mine", vocabulary=VOCABULARY)
+    write_json(tmp_path / "mine" / "vocabulary.json", content)
+    with pytest.raises(UserError, match=r"vocabulary\.json holds no words"):
+        from_pretrained(tmp_path / "mine")
+
+
+def test_other_files_of_a_folder_stay(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    kept = {"thesis.tex": "chapter 1", ".git/HEAD": "ref: refs/heads/main", "README.md": "# Mine"}
+    for name, text in kept.items():
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text(text)
+    assert save_pretrained(make_policy(SHAPES), ".", vocabulary=VOCABULARY) == Path()
+    assert {name: Path(name).read_text() for name in kept} == kept
+    assert {path.name for path in Path().iterdir()} == {
+        "thesis.tex",
+        ".git",
+        "README.md",
+        "network.safetensors",
+        "vocabulary.json",
+    }
+    assert from_pretrained(".").vocabulary == VOCABULARY
+
+
+def test_a_folder_that_is_none_is_refused(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for name in ("file", "link", "file/below"):
+        with pytest.raises(UserError, match=f"{name} is no folder and cannot be made one"):
+            save_pretrained(make_policy(SHAPES), tmp_path / name)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_network_takes_the_place_of_another(tmp_path):
     save_pretrained(make_policy(SHAPES), tmp_path / "mine", vocabulary=VOCABULARY)
     save_pretrained(make_inverse(SHAPES), tmp_path / "mine")
     assert sorted(p.name for p in (tmp_path / "mine").iterdir()) == [
@@ -58,6 +122,15 @@ def test_what_cannot_be_shared_or_found_is_said(tmp_path, monkeypatch):
         from_pretrained(tmp_path / "missing")
     with pytest.raises(UserError, match=r"no folder.*user/name"):
         from_pretrained("missing")
+    save_pretrained(make_policy(SHAPES), tmp_path / "mine")
+    with pytest.raises(UserError, match="is a file: pass the folder"):
+        from_pretrained(tmp_path / "mine" / "network.safetensors")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="runs/policy is neither a folder nor a repository"):
+        from_pretrained("runs/policy")
+    with pytest.raises(UserError, match=r"neither a folder .*HFValidationError"):
+        from_pretrained("some--one/policy")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(UserError, match=r"ifo-grounding\[hub\]"):
         from_pretrained("someone/something")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +43,7 @@ def from_huggingface(
     Args:
         dataset: one split as a ``Dataset`` or ``IterableDataset``, or rows from anywhere. An
             episode's frames are pictures (of Pillow, or PNG or JPEG as ``{"bytes": ...}``), or
-            one array, uint8 [T + 1, C, H, W].
+            one array, uint8 [T + 1, C, H, W], such as a column ``Array4D``.
         frames: name of the column of frames.
         instruction: name of the column of instructions.
         vocabulary: the words of the instructions; by default those that occur.
@@ -69,7 +69,7 @@ def from_huggingface(
 
 
 def _selected(dataset: Any, frames: str, instruction: str) -> Iterable[Mapping[str, Any]]:
-    """Leave two columns of a dataset; other iterables stay as they are."""
+    """Leave two columns of a dataset, arrays as bytes; other iterables stay as they are."""
     if isinstance(dataset, Mapping):
         splits = ", ".join(map(repr, dataset))
         raise UserError(f"choose one of the splits: dataset[...] with {splits}")
@@ -82,7 +82,20 @@ def _selected(dataset: Any, frames: str, instruction: str) -> Iterable[Mapping[s
                 f"the dataset has no column {name!r}, but {', '.join(columns)}: name it with "
                 f"{option}=..."
             )
-    return dataset.with_format(None).select_columns([frames, instruction])
+    selected = dataset.select_columns([frames, instruction])
+    feature: Any = (dataset.features or {}).get(frames)
+    while hasattr(feature, "feature"):  # lists of lists
+        feature = feature.feature
+    if getattr(feature, "dtype", None) == "uint8":
+        rows = selected.with_format("numpy")
+        return ({**row, frames: _as_bytes(row[frames])} for row in rows)
+    return selected.with_format(None)
+
+
+def _as_bytes(shown: Any) -> Any:
+    """Return an array as bytes again: ``datasets`` reads them as int64, and NaN for none."""
+    kind = np.asarray(shown).dtype.kind
+    return shown.astype(np.uint8) if kind == "i" else None if kind == "f" else shown
 
 
 def _episodes(
@@ -92,7 +105,14 @@ def _episodes(
         if missing := {frames, instruction} - set(row):
             raise UserError(f"episode {number} has no {' and no '.join(sorted(missing))}")
         shown = row[frames]
-        if len(shown) and isinstance(shown[0], Image.Image | Mapping):
+        if shown is None:
+            raise UserError(f"episode {number} has no frames (found None)")
+        if isinstance(shown, Image.Image | Mapping):
+            raise UserError(
+                f"episode {number} is a single picture, but a row is one episode: group the rows "
+                "of an episode, so that its frames are a list of pictures"
+            )
+        if isinstance(shown, Sequence) and any(map(_is_picture, shown)):
             shown = stack_pictures(number, _pictures(number, shown))
         yield number, shown, row[instruction]
 
@@ -105,21 +125,31 @@ def _numbered(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, Mapping[
             row = next(rest)
         except StopIteration:
             return
-        except (OSError, SyntaxError) as error:
+        except (OSError, SyntaxError, ValueError) as error:
             raise UserError(f"episode {number} cannot be read ({error})") from None
         yield number, row
+
+
+def _is_picture(one: Any) -> bool:
+    """Whether a frame is a picture, or stands where one is missing."""
+    return one is None or isinstance(one, Image.Image | Mapping)
 
 
 def _pictures(number: int, shown: Iterable[Any]) -> Iterator[tuple[str, Image.Image]]:
     for step, picture in enumerate(shown):
         if isinstance(picture, Mapping):
-            content = picture.get("bytes")
+            content: Any = picture.get("bytes")
+            path: Any = picture.get("path")
+            if content is None and path is None:
+                raise UserError(f"episode {number}: frame {step} has neither bytes nor a path")
             try:
-                picture = Image.open(picture["path"] if content is None else BytesIO(content))
-            except (OSError, SyntaxError) as error:
+                picture = Image.open(path if content is None else BytesIO(content))
+            except (OSError, SyntaxError, TypeError) as error:
                 raise UserError(
                     f"episode {number}: frame {step} cannot be read ({error})"
                 ) from None
+        if not isinstance(picture, Image.Image):
+            raise UserError(f"episode {number}: frame {step} is {picture!r:.40}, not a picture")
         yield f"frame {step}", picture
 
 

@@ -35,7 +35,8 @@ class LabelReport:
     """
 
     actions: Tensor
-    """Label of each transition, in the order of ``Demonstrations.locate()``, integer [M]."""
+    """Label of each transition, in the order of ``Demonstrations.locate()``, integer [M]: uint8
+    where it fits, int32 for more than 256 actions."""
     confidence: Tensor
     """Probability that the model gave to its label, float32 [M]."""
     n_actions: int
@@ -137,7 +138,7 @@ def label_demonstrations(
             logits = _logits(demos, inverse, numbers, device, logits_key)
             n_actions = logits.shape[-1]
             best = logits.float().softmax(-1).max(-1)
-            labels.append(best.indices.to("cpu", torch.uint8))
+            labels.append(best.indices.to("cpu", torch.uint8 if n_actions <= 256 else torch.int32))
             sure.append(best.values.cpu())
             bar.update(len(numbers))
     report = LabelReport(torch.cat(labels), torch.cat(sure), n_actions)

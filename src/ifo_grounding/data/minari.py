@@ -20,6 +20,7 @@ from ifo_grounding.data._reading import LAST, Episode
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import check_colours, rgb
 from ifo_grounding.errors import UserError, extra
+from ifo_grounding.files import atomic_write
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
@@ -178,46 +179,59 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
 
     Args:
         demos: with a vocabulary.
-        dataset_id: such as ``"mine/boxes-v0"``, below ``$MINARI_DATASETS_PATH``.
+        dataset_id: such as ``"mine/boxes-v0"``, below ``$MINARI_DATASETS_PATH``; it appears when
+            everything is written.
         details: for ``minari.create_dataset_from_buffers``, such as ``author``.
 
     Raises:
-        UserError: where Minari is missing, the dataset exists, there is no vocabulary, or frames
-            are no pictures.
+        UserError: where Minari is missing, the id is none or taken, there is no vocabulary, or
+            frames are no pictures.
     """
     minari = _minari()
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.dataset.minari_storage import MinariStorage
     from minari.storage.datasets_root_dir import get_dataset_path
 
     sentences = demos.sentences()
     check_colours(demos)
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):  # the latter where the version is missing
+        raise UserError(
+            f"{dataset_id!r} is no id of a dataset: it has to be such as 'boxes-v0' or "
+            "'mine/boxes-v0', of letters, digits, - and _"
+        ) from None
     folder = get_dataset_path(dataset_id)
     if folder.exists():
         raise UserError(f"the dataset {dataset_id!r} exists: choose another name or version")
     _, height, width = demos.image_shape
     characters = "".join(sorted(set("".join(sentences))))
+    observations = {
+        IMAGE: spaces.Box(0, 255, (height, width, 3), np.uint8),
+        INSTRUCTION: spaces.Text(max(map(len, sentences)), charset=characters),
+    }
     try:
-        with warnings.catch_warnings():
+        with atomic_write(folder) as unfinished, warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*None", UserWarning)  # of details left out
-            dataset = minari.create_dataset_from_buffers(
-                dataset_id,
-                _buffers(demos, sentences),
-                observation_space=spaces.Dict(
-                    {
-                        IMAGE: spaces.Box(0, 255, (height, width, 3), np.uint8),
-                        INSTRUCTION: spaces.Text(max(map(len, sentences)), charset=characters),
-                    }
-                ),
-                action_space=spaces.Discrete(1),
-                jpeg_encoding=False,
-                **{"description": DESCRIPTION, **details},
-            )
-        dataset.storage.update_metadata({ABSENT: True})
-    except BaseException as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, ValueError):  # a name that Minari does not take, for one
-            raise UserError(f"{dataset_id!r} cannot be written: {error}") from None
-        raise
-    return dataset
+            try:
+                minari.create_dataset_from_buffers(
+                    dataset_id,
+                    [],
+                    observation_space=spaces.Dict(observations),
+                    action_space=spaces.Discrete(1),
+                    jpeg_encoding=False,
+                    **{"description": DESCRIPTION, **details},
+                )
+                folder.rename(unfinished)  # a dotted folder, which Minari does not list
+            except BaseException:
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            storage = MinariStorage.read(unfinished / "data")
+            storage.update_episodes(_buffers(demos, sentences))
+            storage.update_metadata({ABSENT: True})
+    except ValueError as error:  # a detail that Minari does not take, for one
+        raise UserError(f"{dataset_id!r} cannot be written: {error}") from None
+    return minari.load_dataset(dataset_id)
 
 
 def _buffers(demos: Demonstrations, sentences: list[str]) -> Iterator[EpisodeBuffer]:

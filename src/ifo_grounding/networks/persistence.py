@@ -48,18 +48,24 @@ def save(module: nn.Module, path: str | Path) -> None:
     >>> all(map(torch.equal, policy.state_dict().values(), again.state_dict().values()))
     True
     """
+    plan = asdict(plan_of(module))
+    metadata = {"format": FORMAT, "network": json.dumps(plan, sort_keys=True)}
+    weights = {
+        name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()
+    }
+    with atomic_write(path) as temporary:
+        save_file(weights, temporary, metadata)
+
+
+def plan_of(module: nn.Module) -> Blueprint:
+    """Return the plan that a network was built by, or refuse what no ``make_*`` function built."""
     plan = getattr(module, "network_config", None)
     if not isinstance(plan, Blueprint):
         raise UserError(
             f"cannot save {type(module).__name__}: only what a make_* function of "
             "ifo_grounding.networks built can be saved"
         )
-    metadata = {"format": FORMAT, "network": json.dumps(asdict(plan), sort_keys=True)}
-    weights = {
-        name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()
-    }
-    with atomic_write(path) as temporary:
-        save_file(weights, temporary, metadata)
+    return plan
 
 
 def load(

@@ -12,12 +12,14 @@ from torch import nn
 from ifo_grounding.errors import UserError, extra
 from ifo_grounding.files import atomic_write, read_json, write_json
 from ifo_grounding.networks.building import Blueprint
-from ifo_grounding.networks.persistence import load, save
+from ifo_grounding.networks.persistence import load, plan_of, save
+from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 WEIGHTS = "network.safetensors"
 WORDS = "vocabulary.json"
 CARD = "README.md"
+LIBRARY = "library_name: ifo-grounding"
 ROLES = {
     "policy": "chooses an action for an image and an instruction",
     "value": "estimates the learned return of an image and an instruction",
@@ -40,8 +42,11 @@ def save_pretrained(
 
     Args:
         module: what a ``make_*`` function built.
-        folder: where to; it appears when everything is written.
-        vocabulary: the words of its token ids; :func:`from_pretrained` gives them back.
+        folder: where to. In a folder that exists, ``network.safetensors``, ``vocabulary.json`` and
+            the card are replaced one by one, the weights last. Everything else stays, and so does
+            a ``README.md`` that is no card of this library.
+        vocabulary: the words of its token ids, by default the ``vocabulary`` of ``module``;
+            :func:`from_pretrained` gives them back.
         facts: what the card says, such as ``{"Task": "move", "Success": "99.7% [99.5, 99.8]"}``.
         hub_id: ``user/name`` on the Hub; needs the extra ``hub`` and an account that is logged in.
 
@@ -49,7 +54,8 @@ def save_pretrained(
         The folder.
 
     Raises:
-        UserError: for a module that no ``make_*`` function built, or a missing extra.
+        UserError: for a module that no ``make_*`` function built, words that do not fit it, a
+            ``folder`` that is none, or a missing extra.
 
     >>> import tempfile
     >>> from ifo_grounding.networks import Shapes, make_policy
@@ -60,19 +66,36 @@ def save_pretrained(
     ...     from_pretrained(made).vocabulary.words
     ('go', 'up')
     """
-    folder = Path(folder)
-    with atomic_write(folder) as temporary:
-        temporary.mkdir()
-        save(module, temporary / WEIGHTS)
-        plan: Blueprint = module.network_config  # type: ignore[assignment]
-        if vocabulary is not None:
-            words = {"words": list(vocabulary.words), "length": vocabulary.length}
-            write_json(temporary / WORDS, words)
-        (temporary / CARD).write_text(_card(plan, facts or {}), encoding="utf-8")
+    folder, plan = Path(folder), plan_of(module)
+    if vocabulary is None:
+        vocabulary = getattr(module, "vocabulary", None)
+    if vocabulary is not None:
+        _check_fit(vocabulary, plan.shapes, "the vocabulary")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"{folder} is no folder and cannot be made one ({error.strerror}): choose another"
+        ) from None
+    if vocabulary is None:
+        (folder / WORDS).unlink(missing_ok=True)  # of the network that was here before
+    else:
+        words = {"words": list(vocabulary.words), "length": vocabulary.length}
+        write_json(folder / WORDS, words)
+    card = folder / CARD
+    if not card.exists() or LIBRARY in card.read_text(encoding="utf-8", errors="replace"):
+        with atomic_write(card) as temporary:
+            temporary.write_text(_card(plan, facts or {}), encoding="utf-8")
+    save(module, folder / WEIGHTS)
     if hub_id is not None:
         hub = _hub()
         hub.create_repo(hub_id, exist_ok=True)
-        hub.upload_folder(repo_id=hub_id, folder_path=str(folder))
+        hub.upload_folder(
+            repo_id=hub_id,
+            folder_path=str(folder),
+            allow_patterns=[WEIGHTS, WORDS, CARD],
+            delete_patterns=[WORDS],  # where this network has none
+        )
     return folder
 
 
@@ -90,17 +113,56 @@ def from_pretrained(
         The network, in eval mode, with the words of its token ids as ``vocabulary``, or None.
 
     Raises:
-        UserError: where there is no such folder, or it holds no network of that kind.
+        UserError: where there is no such folder, on this machine or on the Hub, or it holds no
+            network of that kind, or its words are damaged or another network's.
     """
     folder = Path(source)
+    if folder.is_file():
+        raise UserError(f"{source} is a file: pass the folder that save_pretrained wrote")
     if not folder.is_dir():
         if str(source).count("/") != 1 or str(source).startswith((".", "/", "~")):
             raise UserError(f"{source} is no folder; on the Hub a network is called user/name")
-        folder = Path(_hub().snapshot_download(str(source), allow_patterns=[WEIGHTS, WORDS, CARD]))
+        folder = _downloaded(str(source))
     module = load(folder / WEIGHTS, device=device, kind=kind)
-    words = read_json(folder / WORDS) if (folder / WORDS).exists() else None
-    module.vocabulary = Vocabulary(words["words"], words["length"]) if words else None
+    words = folder / WORDS
+    module.vocabulary = _vocabulary(words, plan_of(module).shapes) if words.exists() else None
     return module
+
+
+def _downloaded(hub_id: str) -> Path:
+    hub = _hub()
+    try:
+        return Path(hub.snapshot_download(hub_id, allow_patterns=[WEIGHTS, WORDS, CARD]))
+    except (OSError, ValueError) as error:  # what all errors of the Hub are
+        reason = (str(error) or "no reason given").splitlines()[0]
+        raise UserError(
+            f"{hub_id} is neither a folder nor a repository of the Hugging Face Hub that can be "
+            f"reached ({type(error).__name__}: {reason}): mend the name, or the connection"
+        ) from None
+
+
+def _vocabulary(path: Path, shapes: Shapes) -> Vocabulary:
+    """Read the words of a network, or refuse what is damaged or another network's."""
+    found = read_json(path)
+    try:
+        vocabulary = Vocabulary(found["words"], found["length"])
+    except (TypeError, KeyError, AttributeError, UserError) as error:
+        raise UserError(
+            f"{path} holds no words ({type(error).__name__}: {error}): restore it, or save the "
+            "network again with its vocabulary"
+        ) from None
+    _check_fit(vocabulary, shapes, str(path))
+    return vocabulary
+
+
+def _check_fit(vocabulary: Vocabulary, shapes: Shapes, name: str) -> None:
+    given = len(vocabulary), vocabulary.length
+    taken = shapes.vocabulary_size, shapes.instruction_length
+    if given[0] > taken[0] or given[1] != taken[1]:
+        raise UserError(
+            f"{name} has {given[0]} token ids and {given[1]} per instruction, but the network was "
+            f"built for {taken[0]} and {taken[1]}: pass the vocabulary that it was built for"
+        )
 
 
 def _card(plan: Blueprint, facts: Mapping[str, object]) -> str:
@@ -115,7 +177,7 @@ def _card(plan: Blueprint, facts: Mapping[str, object]) -> str:
     }
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items() if value is not None)
     return f"""---
-library_name: ifo-grounding
+{LIBRARY}
 license: mit
 tags: [torchrl, imitation-from-observation, language-grounding, reinforcement-learning]
 ---
