@@ -27,9 +27,17 @@ def episodes(seed: int = 0) -> list[torch.Tensor]:
     return list(render(random_layout(sum(LENGTHS), generator=draw)).split(LENGTHS))
 
 
+def made(frames: list[torch.Tensor], tile_size: int | None = None) -> Demonstrations:
+    """Demonstrations of which some may be single frames, as recordings of others may not."""
+    codec, codes = FrameCodec.compress(torch.cat(frames), tile_size)
+    vocabulary = Vocabulary.from_sentences(SENTENCES)
+    lengths, tokens = torch.tensor([len(part) for part in frames]), vocabulary.encode(SENTENCES)
+    return Demonstrations(codec, codes, lengths, tokens, vocabulary=vocabulary)
+
+
 @pytest.fixture
 def demos() -> Demonstrations:
-    return Demonstrations.from_arrays(episodes(), SENTENCES)
+    return made(episodes())
 
 
 def numbered(n: int = 50, length: int = 4) -> Demonstrations:
@@ -138,7 +146,7 @@ def test_the_pool_holds_each_instruction_once(demos):
     assert pool.dtype == torch.int64
     assert sorted(demos.vocabulary.decode(pool)) == ["go left", "go up", "take it"]
     tokens = torch.randint(0, 3, (500, 4))
-    frames = [torch.zeros(1, 1, 8, 8, dtype=torch.uint8)] * 500
+    frames = [torch.zeros(2, 1, 8, 8, dtype=torch.uint8)] * 500
     pool = Demonstrations.from_arrays(frames, tokens).pool()
     assert torch.equal(pool, tokens.unique(dim=0))
 
@@ -158,7 +166,7 @@ def test_a_split_sets_episodes_aside():
 def test_episodes_are_closed_where_they_do_not_end_with_a_repeated_frame():
     first, alone, second, closed = episodes()
     closed = closed[[0, 0]]
-    demos = Demonstrations.from_arrays([first, alone, second, closed], SENTENCES).close_episodes()
+    demos = made([first, alone, second, closed]).close_episodes()
     assert demos.lengths.tolist() == [4, 2, 6, 2]
     for number, frames in enumerate((first, alone, second)):
         assert torch.equal(demos[number]["pixels"], torch.cat([frames, frames[-1:]]))
@@ -169,9 +177,9 @@ def test_episodes_are_closed_where_they_do_not_end_with_a_repeated_frame():
 
 
 def test_frames_may_come_as_a_generator_of_numpy_arrays():
-    given = (frames.numpy() for frames in episodes())
+    given = (frames.repeat(2, 1, 1, 1).numpy() for frames in episodes())
     demos = Demonstrations.from_arrays(given, VOCABULARY.encode(["go up"] * 4), tile_size=16)
-    assert torch.equal(demos[2]["pixels"], episodes()[2])
+    assert torch.equal(demos[2]["pixels"], episodes()[2].repeat(2, 1, 1, 1))
     assert (demos.vocabulary, demos.vocabulary_size, demos.tile_size) == (
         None,
         int(VOCABULARY.encode("go up").max()) + 1,
@@ -283,11 +291,13 @@ GOOD = np.zeros((3, 3, 16, 24), np.uint8)
         (GOOD[:0], "go", "at least one frame"),
         (GOOD, " ", r"has no instruction \(found ' '\)"),
         (GOOD, None, r"has no instruction \(found None\)"),
+        (GOOD, GOOD, r"has no instruction \(found a ndarray\): give a sentence"),
+        (GOOD, "go go", r"of 2 words, 1 are allowed: give a vocabulary with length=2"),
+        (None, "go", "has no frames"),
         (GOOD, "jump", "unknown word 'jump'"),
         (GOOD[..., :8], "go", r"\[3, 16, 8\], the others have \[3, 16, 24\] \(such as episode 'a'"),
         (GOOD.transpose(0, 2, 3, 1), "go", "with the colours last"),
         (GOOD[:, 0], "go", "C is 1 for grey"),
-        (np.zeros((3, 4, 16, 24), np.uint8), "go", r"an alpha channel: .* frames\[:, :3\]"),
         (GOOD / np.float32(1), "go", r"float32 .* of 0 to 0: .*np.round\(255 \* frames\)"),
         (GOOD + 200.0, "go", r"float64 .* of 200 to 200: .*np.round\(frames\)"),
         (GOOD.astype(np.int64), "go", "is torch.int64"),
@@ -295,9 +305,56 @@ GOOD = np.zeros((3, 3, 16, 24), np.uint8)
     ],
 )
 def test_what_is_wrong_with_an_episode_is_said_with_its_name(frames, sentence, said):
+    words = Vocabulary(["go"], length=1)
     given = [("a", GOOD, "go"), ("b", frames, sentence)]
     with pytest.raises(UserError, match=f"^episode 'b'.*{said}"):
-        Demonstrations.from_episodes(given, vocabulary=Vocabulary(["go"]))
+        Demonstrations.from_episodes(given, vocabulary=words)
+    said = said.replace("'a'", "0")
+    with pytest.raises(UserError, match=f"^episode 1.*{said}") as error:
+        Demonstrations.from_arrays([GOOD, frames], ["go", sentence], vocabulary=words)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("episode", "said"),
+    [
+        (("b", GOOD), "a tuple of 2"),
+        ({"frames": GOOD}, "a dict"),
+        (GOOD, "a ndarray"),
+        ("one", "a str"),
+        (None, "a NoneType"),
+    ],
+)
+def test_other_things_than_episodes_are_refused(episode, said):
+    with pytest.raises(UserError, match=f"^episode 1 is {said}: give a tuple of three, name"):
+        Demonstrations.from_episodes([("a", GOOD, "go"), episode])
+
+
+def test_there_is_one_instruction_for_each_array():
+    with pytest.raises(UserError, match=r"^episode 1 has no instruction"):
+        Demonstrations.from_arrays([GOOD] * 2, ["go"])
+    with pytest.raises(UserError, match=r"^episode 2 has no frames"):
+        Demonstrations.from_arrays(iter([GOOD] * 2), ["go"] * 3)
+    tokens = torch.ones(2, 1).long()
+    with pytest.raises(UserError, match=r"^episode 1 has 1 frame"):
+        Demonstrations.from_arrays([GOOD, GOOD[:1]], tokens)
+
+
+def test_instructions_are_as_long_as_the_longest_or_as_told():
+    sentences = ["go", " ".join(["on"] * 20)]
+    demos = Demonstrations.from_arrays([GOOD] * 2, sentences)
+    assert demos.instruction_length == 20 and demos.sentences() == sentences
+    assert Demonstrations.from_arrays([GOOD] * 2, sentences, length=24).instruction_length == 24
+    with pytest.raises(UserError, match=r"^episode 1 .* 20 words, 8 are allowed: give length=20"):
+        Demonstrations.from_arrays([GOOD] * 2, sentences, length=8)
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+def test_grey_frames_and_frames_with_alpha_will_do(channels, tmp_path):
+    frames = torch.randint(256, (3, channels, 16, 24), dtype=torch.uint8)
+    demos = Demonstrations.from_arrays([frames], ["go"])
+    demos.save(tmp_path / "d")
+    assert torch.equal(Demonstrations.load(tmp_path / "d")[0]["pixels"], frames)
 
 
 def test_arrays_may_be_views():
@@ -463,7 +520,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("name", DAMAGE)
 def test_a_damaged_or_foreign_folder_is_refused_with_what_is_wrong(name, tmp_path):
-    demos = Demonstrations.from_arrays(episodes(), SENTENCES, tile_size=8)
+    demos = made(episodes(), tile_size=8)
     folder = tmp_path / "d"
     demos.save(folder)
     assert same(Demonstrations.load(folder), demos)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ifo_grounding.data import (
     Demonstrations,
+    FrameCodec,
     LabelReport,
     label_demonstrations,
     labelled_buffer,
@@ -168,7 +169,8 @@ def test_bad_input_is_refused(inverse):
     demos = record_demonstrations("move", 5)
     with pytest.raises(UserError, match="batch_size must be"):
         label_demonstrations(demos, inverse, batch_size=0)
-    alone = Demonstrations.from_arrays([torch.zeros(1, 3, 8, 8, dtype=torch.uint8)], ["go"])
+    frame, token = torch.zeros(1, 3, 8, 8, dtype=torch.uint8), torch.ones(1, 1).long()
+    alone = Demonstrations(FrameCodec((3, 8, 8)), frame, torch.tensor([1]), token)
     with pytest.raises(UserError, match="nothing to label"):
         label_demonstrations(alone, inverse)
     flat = TensorDictModule(lambda pixels: pixels.float().flatten(2), ["pixels"], ["logits"])

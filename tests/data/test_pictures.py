@@ -1,4 +1,5 @@
 import json
+import random
 
 import av
 import numpy as np
@@ -29,6 +30,50 @@ def test_animations_hold_every_frame(tmp_path):
     assert back.sentences() == demos.sentences()
 
 
+@pytest.mark.parametrize("shown", ["aaabb", "aa", "abaa", "ab"])
+def test_animations_repeat_equal_frames(shown, tmp_path):
+    draw = torch.Generator().manual_seed(0)
+    few = torch.randint(0, 2, (2, 3, 16, 24), dtype=torch.uint8, generator=draw) * 255
+    frames = few[["ab".index(letter) for letter in shown]]
+    save_pictures(
+        Demonstrations.from_arrays([frames], ["go"]), tmp_path / "shown", kind="gif", scale=2
+    )
+    back = load_pictures(tmp_path / "shown", close=False)
+    large = frames.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    assert torch.equal(back[0]["pixels"], large)
+
+
+def test_each_picture_of_another_gif_is_a_frame(tmp_path):
+    first, *others = (Image.new("RGB", (24, 16), colour) for colour in ("red", "blue", "green"))
+    first.save(
+        tmp_path / "a.gif", save_all=True, append_images=others, duration=[500, 40, 0], comment="by"
+    )
+    list_of(tmp_path, ["a"])
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [3]
+
+
+def test_animations_that_are_cut_short_are_refused(tmp_path):
+    noise = np.random.default_rng(0).integers(256, size=(4, 8, 8, 3), dtype=np.uint8)
+    first, *others = map(Image.fromarray, noise)
+    # A transparent colour with the number of the trailer byte: a cut right after it must not pass.
+    first.save(
+        tmp_path / "a.gif",
+        save_all=True,
+        append_images=others,
+        duration=590,
+        transparency=59,
+        disposal=2,
+    )
+    list_of(tmp_path, ["a"])
+    path = tmp_path / "a.gif"
+    content = path.read_bytes()
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [4]
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
+        with pytest.raises(UserError, match=r"^episode 'a': .*a\.gif.* cannot be read"):
+            load_pictures(tmp_path)
+
+
 def test_videos_show_every_frame_at_twice_the_size(demos, tmp_path):
     demos = demos[:8]
     save_pictures(demos, tmp_path / "shown", kind="mp4", scale=2)
@@ -50,10 +95,21 @@ def test_grey_frames_become_pictures(tmp_path):
     )
 
 
-@pytest.mark.parametrize("kind", ["png", "gif", "mp4"])
-def test_frames_that_are_no_pictures_are_refused(kind, tmp_path):
-    frames = torch.zeros(4, 2, 16, 24, dtype=torch.uint8)
-    with pytest.raises(UserError, match="1 or 3 colours, these frames have 2"):
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_pictures_come_back_with_as_many_channels(channels, tmp_path):
+    frames = torch.randint(256, (4, channels, 16, 24), dtype=torch.uint8)
+    save_pictures(Demonstrations.from_arrays([frames], ["go on"]), tmp_path / "shown")
+    back = load_pictures(tmp_path / "shown", channels=channels, close=False)
+    assert torch.equal(back[0]["pixels"], frames)
+
+
+@pytest.mark.parametrize(
+    ("kind", "channels", "allowed"),
+    [("png", 2, "1, 3 or 4"), ("gif", 2, "1 or 3"), ("gif", 4, "1 or 3"), ("mp4", 4, "1 or 3")],
+)
+def test_frames_that_are_no_pictures_are_refused(kind, channels, allowed, tmp_path):
+    frames = torch.zeros(4, channels, 16, 24, dtype=torch.uint8)
+    with pytest.raises(UserError, match=f"{allowed} colours, these frames have {channels}"):
         save_pictures(Demonstrations.from_arrays([frames], ["go"]), tmp_path / "shown", kind=kind)
     assert not list(tmp_path.iterdir())
 
@@ -106,6 +162,62 @@ def test_any_path_and_colour_mode_will_do(tmp_path):
     assert demos.sentences() == ["go on"]
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"{number}.png" for number in range(12)],
+        [f"{number:02d}.png" for number in range(90, 102)],
+        [f"cam2-{number}.png" for number in range(0, 60, 5)],
+        [f"{number}.{half}.png" for number in range(9, 12) for half in (0, 5)],
+        ["start.png", "step 2.png", "step 10.png", "stop.png"],
+    ],
+)
+def test_frames_are_in_the_order_of_their_numbers(names, tmp_path):
+    values = {name: 9 * value for value, name in enumerate(names)}
+    for name in random.Random(0).sample(names, len(names)):
+        picture(tmp_path / "a" / name, values[name])
+    list_of(tmp_path, ["a"])
+    demos = load_pictures(tmp_path, close=False)
+    assert all_frames(demos)[:, 0, 0, 0].tolist() == list(values.values())
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["0000", "0001", "0003", "0005"], r"0002\.png is missing between 0001\.png and 0003\.png"),
+        (["cam-8", "cam-9", "cam-11"], r"cam-10\.png is missing between cam-9\.png and cam-11"),
+        (["0", "5", "10", "20"], r"15\.png is missing between 10\.png and 20\.png"),
+        (["0", "1", "01", "3"], r"01\.png and 1\.png have the same number"),
+    ],
+)
+def test_missing_frames_are_named(names, said, tmp_path):
+    for name in names:
+        picture(tmp_path / "a" / f"{name}.png", 7)
+    list_of(tmp_path, ["a"])
+    with pytest.raises(UserError, match=f"^episode 'a': {said}"):
+        load_pictures(tmp_path)
+
+
+def list_of(folder, names):
+    lines = [json.dumps({"episode": name, "instruction": "go"}) for name in names]
+    (folder / "episodes.jsonl").write_text("\n".join(lines))
+
+
+def test_the_list_may_have_a_mark_and_any_line_break_in_a_sentence(tmp_path):
+    write(tmp_path, [("a", "go", [0, 1])])
+    line = '{"episode": "a", "instruction": "go\u2028on"}\r\n'
+    (tmp_path / "episodes.jsonl").write_bytes(line.encode("utf-8-sig"))
+    assert load_pictures(tmp_path).sentences() == ["go on"]
+
+
+def test_suffixes_may_be_in_any_case(demos, tmp_path):
+    save_pictures(demos[:3], tmp_path / "shown", kind="gif")
+    for name, suffix in zip("012", (".GIF", ".Gif", ".gif"), strict=True):
+        path = tmp_path / "shown" / f"{name}.gif"
+        path.rename(path.with_suffix(suffix))
+    assert torch.equal(load_pictures(tmp_path / "shown").lengths, demos[:3].lengths)
+
+
 def picture(path, value, size=(24, 16), mode="RGB"):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.full((size[1], size[0], 3), value, np.uint8)).convert(mode).save(path)
@@ -156,6 +268,18 @@ def deep(folder):
         (lambda f: (f / "episodes.jsonl").write_text("go"), "line 1: a line is a JSON object"),
         (lambda f: (f / "episodes.jsonl").write_text('["a"]'), "line 1: a line is a JSON object"),
         (lambda f: write(f, [("a", " ", [0, 1])]), "episode 'a' has no instruction"),
+        (
+            lambda f: write(f, [("a", "go", [0]), ("b", None, [0])]),
+            "episode 'b' has no instruction .*, line 2.: give a sentence, not null",
+        ),
+        (
+            lambda f: write(f, [("a", ["go", "on"], [0])]),
+            r"'a' .* line 1\): .* not \[\"go\", \"on\"\]",
+        ),
+        (
+            lambda f: (f / "episodes.jsonl").write_bytes("{é}".encode("latin-1")),
+            r"episodes\.jsonl cannot be read .*: save it as UTF-8",
+        ),
         (lambda f: write(f, [("a", "go", [0, 1])] * 2), "lists episode 'a' 2 times"),
         (lambda f: write(f, [("a", "go", [0, 1]), ("c", "go", [])]), "episode 'c' has no frames"),
         (lambda f: [p.unlink() for p in (f / "b").iterdir()], "episode 'b' has no frames"),
@@ -185,6 +309,16 @@ def test_an_unknown_word_names_its_episode(tmp_path):
         load_pictures(tmp_path, vocabulary=Vocabulary(["go"]))
 
 
+@pytest.mark.parametrize("kind", ["png", "gif"])
+def test_what_is_there_is_not_replaced(kind, demos, tmp_path):
+    save_pictures(demos[:1], tmp_path, kind=kind)
+    before = sorted(tmp_path.rglob("*"))
+    for folder in (tmp_path, tmp_path / "episodes.jsonl"):
+        with pytest.raises(UserError, match="exists and is no empty folder: name another one"):
+            save_pictures(demos, folder)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_nothing_half_written_stays_behind(demos, tmp_path, monkeypatch):
     def fail(*args, **kwargs):
         raise OSError("disk full")
@@ -199,6 +333,11 @@ def test_nothing_half_written_stays_behind(demos, tmp_path, monkeypatch):
 def test_bad_options_are_refused(options, said, demos, tmp_path):
     with pytest.raises(UserError, match=said):
         save_pictures(demos, tmp_path / "shown", **options)
+
+
+def test_pictures_have_no_two_channels(tmp_path):
+    with pytest.raises(UserError, match="unknown channels 2: choose one of 1, 3, 4"):
+        load_pictures(tmp_path, channels=2)
 
 
 def test_arrays_with_the_colours_last_are_recognised():

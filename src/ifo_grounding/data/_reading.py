@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -16,11 +17,19 @@ from ifo_grounding.tasks.vocabulary import Vocabulary
 PIECE_FRAMES = 512
 PIECE_BYTES = 16 << 20
 COLOURS = (1, 3)
-LAST = (*COLOURS, 4)
+MODES = {1: "L", 3: "RGB", 4: "RGBA"}
+"""Modes of Pillow by channels."""
+LAST = tuple(MODES)
 LEAST_SIDE = 8
 """Arrays whose last axis alone is shorter than this are taken for images with colours last."""
 NOT_BYTES = ("F", "I", "I;16", "I;16L", "I;16B", "I;16N")
 """Modes of Pillow whose values are not bytes: turned into bytes, most become black or white."""
+
+BROKEN = (
+    *(OSError, SyntaxError, ValueError, IndexError, EOFError),
+    *(struct.error, Image.DecompressionBombError),
+)
+"""What Pillow raises for files that are damaged or cut short."""
 
 Name = str | int
 Episode = tuple[Name, Tensor | np.ndarray, str]
@@ -31,15 +40,20 @@ class Reader:
     """Checks episodes one after the other, and notes all of them but the frames.
 
     Args:
-        least: frames that an episode must have.
         close: whether to repeat the last frame of episodes that do not end with a repeated frame.
         vocabulary: the words that instructions may use; any by default.
+        length: words that an instruction may have, without a vocabulary; any number by default.
     """
 
     def __init__(
-        self, *, least: int = 1, close: bool = False, vocabulary: Vocabulary | None = None
+        self,
+        *,
+        close: bool = False,
+        vocabulary: Vocabulary | None = None,
+        length: int | None = None,
     ) -> None:
-        self.least, self.close, self.vocabulary = least, close, vocabulary
+        self.close, self.vocabulary = close, vocabulary
+        self.length = length if vocabulary is None else vocabulary.length
         self.lengths: list[int] = []
         self.sentences: list[str] = []
         self._first: tuple[Name, list[int]] | None = None
@@ -51,7 +65,13 @@ class Reader:
             UserError: naming the first episode that is not as it has to be.
         """
         waiting: list[Tensor] = []
-        for name, frames, sentence in episodes:
+        for number, episode in enumerate(episodes):
+            if not isinstance(episode, tuple | list) or len(episode) != 3:
+                raise UserError(
+                    f"episode {number} is {_kind(episode)}: give a tuple of three, name, frames "
+                    "and instruction"
+                )
+            name, frames, sentence = episode
             self.sentences.append(self._sentence(name, sentence))
             waiting.append(self._frames(name, frames))
             self.lengths.append(len(waiting[-1]))
@@ -66,7 +86,15 @@ class Reader:
 
     def _sentence(self, name: Name, sentence: str) -> str:
         if not isinstance(sentence, str) or not sentence.strip():
-            raise UserError(f"episode {name!r} has no instruction (found {sentence!r})")
+            found = repr(sentence) if isinstance(sentence, str | None) else _kind(sentence)
+            raise UserError(f"episode {name!r} has no instruction (found {found}): give a sentence")
+        words = len(sentence.split())
+        if self.length and words > self.length:
+            longer = "length=" if self.vocabulary is None else "a vocabulary with length="
+            raise UserError(
+                f"episode {name!r} has an instruction of {words} words, {self.length} are allowed: "
+                f"give {longer}{words}"
+            )
         if self.vocabulary is not None:
             with naming(name):
                 self.vocabulary.encode(sentence)
@@ -81,7 +109,7 @@ class Reader:
                 f"episode {name!r} has images {shape}, the others have {expected} (such as episode "
                 f"{first!r}): scale them to one size"
             )
-        if len(frames) < self.least:
+        if len(frames) < 2:
             raise UserError(
                 f"episode {name!r} has {len(frames)} frame: a demonstration shows at least one "
                 "step, which takes two"
@@ -91,13 +119,20 @@ class Reader:
         return frames
 
 
+def _kind(value: object) -> str:
+    sized = f" of {len(value)}" if isinstance(value, tuple | list) else ""
+    return f"a {type(value).__name__}{sized}"
+
+
 def check_frames(name: Name, given: Tensor | np.ndarray) -> Tensor:
     """Return frames of an episode as a tensor.
 
     Raises:
         UserError: naming the episode, where they are not uint8 [T + 1, C, H, W], as far as that can
-            be seen: colours last and alpha channels are refused.
+            be seen: colours last are refused.
     """
+    if given is None:
+        raise UserError(f"episode {name!r} has no frames")
     try:
         frames = (
             given if isinstance(given, Tensor) else torch.as_tensor(np.ascontiguousarray(given))
@@ -116,22 +151,24 @@ def check_frames(name: Name, given: Tensor | np.ndarray) -> Tensor:
     elif frames.dtype != torch.uint8 or frames.ndim != 4:
         wrong = (
             f"is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at least one frame; C is "
-            "1 for grey, 3 for colours"
+            "1 for grey, 3 for colours, 4 with alpha"
         )
-    elif shape[1] not in COLOURS and shape[-1] in LAST and min(shape[1:3]) >= LEAST_SIDE:
+    elif shape[1] not in LAST and shape[-1] in LAST and min(shape[1:3]) >= LEAST_SIDE:
         wrong = (
             f"has images {shape[1:]}, with the colours last: give [T + 1, C, H, W], such as "
             "frames.transpose(0, 3, 1, 2)"
         )
-    elif shape[1] == 4:
-        wrong = f"has images {shape[1:]}, with an alpha channel: give the colours, frames[:, :3]"
     else:
         return frames
     raise UserError(f"episode {name!r} {wrong}")
 
 
-def stack_pictures(name: Name, pictures: Iterable[tuple[str, Image.Image]]) -> np.ndarray:
-    """Return the pictures of an episode, each with its own name, as frames [T + 1, 3, H, W].
+def stack_pictures(
+    name: Name, pictures: Iterable[tuple[str, Image.Image]], channels: int = 3
+) -> np.ndarray:
+    """Return the pictures of an episode, each with its own name, as frames [T + 1, C, H, W].
+
+    C is the number of ``channels``: 1 for grey, 3 for colours, 4 with alpha.
 
     Raises:
         UserError: naming the episode and the picture, where there is none, or one is of another
@@ -145,9 +182,10 @@ def stack_pictures(name: Name, pictures: Iterable[tuple[str, Image.Image]]) -> n
                 "bits per colour"
             )
         try:
-            frames.append(np.asarray(picture.convert("RGB")))
-        except (OSError, SyntaxError) as error:
+            shown = np.asarray(picture.convert(MODES[channels]))
+        except BROKEN as error:
             raise UserError(f"episode {name!r}: {place} cannot be read ({error})") from None
+        frames.append(shown.reshape(*shown.shape[:2], channels))
         if frames[-1].shape != frames[0].shape:
             raise UserError(
                 f"episode {name!r}: {place} has {_size(frames[-1])} pixels, the first frame has "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, overload
 
@@ -96,20 +97,30 @@ class Demonstrations:
         instructions: Tensor | Sequence[str],
         *,
         vocabulary: Vocabulary | None = None,
+        length: int | None = None,
         tile_size: int | None = None,
     ) -> Demonstrations:
-        """Take frames from elsewhere.
+        """Take frames from elsewhere, as they are: :meth:`close_episodes` adds stops.
 
         Args:
-            frames: one uint8 array [T + 1, C, H, W] per episode; a generator is read in pieces.
+            frames: one uint8 array [T + 1, C, H, W] per episode, at least two frames; a generator
+                is read in pieces.
             instructions: token ids, integer [N, L], or sentences.
             vocabulary: the words of the sentences or tokens; by default that of the sentences.
+            length: words that the longest sentence may have, without a vocabulary; by default
+                those of the longest that occurs.
             tile_size: of the codec; the cheapest one by default.
+
+        Raises:
+            UserError: with the number of the episode that is not as it has to be.
         """
         if not isinstance(instructions, Tensor):
-            sentences = list(instructions)
-            vocabulary = vocabulary or Vocabulary.from_sentences(sentences)
-            instructions = vocabulary.encode(sentences)
+            named: Iterable[Any] = (
+                (number, *both) for number, both in enumerate(zip_longest(frames, instructions))
+            )
+            return cls.from_episodes(
+                named, vocabulary=vocabulary, length=length, tile_size=tile_size, close=False
+            )
         reader = Reader()
         episodes = ((number, shown, "as said") for number, shown in enumerate(frames))
         codec, codes = FrameCodec.compress(reader.pieces(episodes), tile_size)
@@ -143,7 +154,7 @@ class Demonstrations:
         >>> Demonstrations.from_episodes(("a", shown, "go on") for _ in range(2)).lengths
         tensor([3, 3])
         """
-        reader = Reader(least=2, close=close, vocabulary=vocabulary)
+        reader = Reader(close=close, vocabulary=vocabulary, length=length)
         codec, codes = FrameCodec.compress(reader.pieces(episodes), tile_size)
         sentences = reader.sentences
         words = vocabulary or Vocabulary.from_sentences(
