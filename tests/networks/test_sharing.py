@@ -23,8 +23,9 @@ SHAPES = Shapes(image_shape=(3, 16, 16), vocabulary_size=len(VOCABULARY))
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 def test_a_shared_network_comes_back_with_its_words(make, tmp_path):
     network = make(SHAPES, seed=0)
-    folder = save_pretrained(network, tmp_path / "mine", vocabulary=VOCABULARY)
+    folder = network.save_pretrained(tmp_path / "mine", vocabulary=VOCABULARY)
     again = from_pretrained(folder)
+    assert type(again) is type(network)
     for name, weight in network.state_dict().items():
         assert torch.equal(weight, again.state_dict()[name])
     assert again.vocabulary == VOCABULARY

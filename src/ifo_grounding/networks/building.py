@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -44,6 +46,27 @@ def blueprint(
     return Blueprint(kind, shapes, replace(config, patch_size=patch_size(shapes, config)), options)
 
 
+class Shareable(nn.Module):
+    """What ``make_*`` functions return: it knows how it was built, and can be saved for others."""
+
+    network_config: Blueprint
+
+    def save_pretrained(self, folder: str | Path, **options: Any) -> Path:
+        """Write a folder, as :func:`~ifo_grounding.networks.save_pretrained` does."""
+        from ifo_grounding.networks.sharing import save_pretrained
+
+        return save_pretrained(self, folder, **options)
+
+    def push_to_hub(self, hub_id: str, **options: Any) -> None:
+        """Send it to the Hugging Face Hub as ``user/name``, with options of the former."""
+        with tempfile.TemporaryDirectory() as folder:
+            self.save_pretrained(folder, hub_id=hub_id, **options)
+
+
+class Network(Shareable, TensorDictModule):
+    """A network with names for what it reads and writes."""
+
+
 Built = TypeVar("Built", bound=nn.Module)
 
 
@@ -70,7 +93,7 @@ def wrap(
     network: nn.Module, plan: Blueprint, in_keys: Sequence[NestedKey], out_keys: list[NestedKey]
 ) -> TensorDictModule:
     """Make a TensorDictModule of ``network`` that carries its blueprint."""
-    module = TensorDictModule(network, in_keys=list(in_keys), out_keys=out_keys)
+    module = Network(network, in_keys=list(in_keys), out_keys=out_keys)
     module.network_config = plan
     return module.eval()
 

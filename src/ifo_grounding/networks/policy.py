@@ -14,7 +14,7 @@ from torchrl.data import Categorical as CategoricalSpec
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from ifo_grounding import keys
-from ifo_grounding.networks.building import blueprint, check_keys, construct
+from ifo_grounding.networks.building import Shareable, blueprint, check_keys, construct
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.transfer import copy_weights, trunk_of
@@ -35,6 +35,14 @@ class ValueNetwork(InstructedNetwork):
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__(shapes, config, 1)
+
+
+class Policy(Shareable, ProbabilisticActor):
+    """An actor that can be saved for others."""
+
+
+class Value(Shareable, ValueOperator):
+    """A value that can be saved for others."""
 
 
 def make_policy(
@@ -86,7 +94,7 @@ def make_policy(
     }
     plan = blueprint("policy", spec_source, preset, options, overrides)
     network = construct(PolicyNetwork, plan, device, seed)
-    policy = ProbabilisticActor(
+    policy = Policy(
         TensorDictModule(network, in_keys=list(in_keys), out_keys=[logits_key]),
         in_keys={"logits": logits_key},
         out_keys=[action_key],
@@ -139,6 +147,6 @@ def make_value(
     network = construct(ValueNetwork, plan, device, seed)
     if init_from is not None:
         copy_weights([(trunk_of(init_from), network.trunk)], init_from, plan)
-    value = ValueOperator(network, in_keys=list(in_keys), out_keys=[out_key])
+    value = Value(network, in_keys=list(in_keys), out_keys=[out_key])
     value.network_config = plan
     return value.eval()
