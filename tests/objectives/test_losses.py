@@ -309,15 +309,25 @@ def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
         InstructionLoss(classifier, pool, removal_rate=0.3).calibrate()
 
 
+def test_an_instruction_of_the_pool_suits_each_scene():
+    torch.manual_seed(0)
+    shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    classifier = make_instruction_classifier(shapes, "strong", seed=0)
+    pool = torch.arange(1, 19).unsqueeze(1).expand(18, 16)
+    loss = InstructionLoss(classifier, pool, removal_rate="estimated")
+    loss.negatives.watch(torch.ones(1000), -torch.ones(1000))  # no other one does
+    assert loss.calibrate() == pytest.approx(1 / 18)
+
+
 @pytest.mark.parametrize("preset", ["film", "strong"])
 def test_negatives_that_were_not_removed_count_as_the_mixture_that_they_are(preset):
     torch.manual_seed(0)
     shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
     classifier = make_instruction_classifier(shapes, preset, seed=0)
-    pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
+    pool = torch.cartesian_prod(*[torch.arange(1, 11)] * 2).repeat(1, 8)
     loss = InstructionLoss(classifier, pool, removal_rate="estimated")
     loss.negatives.watch(torch.ones(1000), torch.cat([torch.ones(20), -torch.ones(980)]))
-    image, words = torch.zeros(12, 3, 48, 48, dtype=torch.uint8), pool
+    image, words = torch.zeros(100, 3, 48, 48, dtype=torch.uint8), pool
     before = classifier(pixels=image, instruction=words)
     assert loss.calibrate() == pytest.approx(0.02)
     after = classifier(pixels=image, instruction=words).sigmoid()

@@ -23,8 +23,6 @@ from ifo_grounding.objectives.pairs import (
 )
 
 UNLABELLED = ("removal", "non-negative")
-LEAST_SHARE = 1e-4
-"""Shares of suitable pairs below this cannot be told from none."""
 
 
 class InstructionLoss(SupervisedLoss):
@@ -119,7 +117,8 @@ class InstructionLoss(SupervisedLoss):
         which is suitable as likely as not. Afterwards it is that of a random pair of a fresh scene
         and the pool, and a threshold means the same for pools in which one of three instructions
         suits and for those in which one of three hundred does. Where so few suit that none were
-        removed, the negatives are taken for what they are, a mixture that holds suitable pairs.
+        removed, the negatives are taken for what they are, a mixture that holds suitable pairs. One
+        instruction of the pool at least suits the scene of a demonstration, its own.
 
         Raises:
             UserError: where the share is unknown, for the removal rate was given.
@@ -127,7 +126,8 @@ class InstructionLoss(SupervisedLoss):
         estimate = self.negatives.estimate
         if estimate is None:
             raise UserError("calibrate needs removal_rate='estimated'")
-        share = min(max(estimate.share(), LEAST_SHARE), MOST_REMOVED)
+        least = 1 / len(self.negatives.pool)
+        share = min(max(estimate.share(), least), MOST_REMOVED)
         mixed = self.unlabelled == "removal" and not self.negatives.share
         self.network.module.expect(share, mixed)
         return share

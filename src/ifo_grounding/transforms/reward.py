@@ -160,9 +160,10 @@ class LearnedReward(EpisodeTransform):
             next_tensordict.set(self.initial_pixels_key, first)
         reward, arrived = self._pay(tensordict, next_tensordict)
         if self.arrival is not None:
-            for name in ("done", "terminated"):
-                flag = next_tensordict.get(name)
-                next_tensordict.set(name, flag | arrived.view_as(flag))
+            for key in self.parent.done_keys:
+                if (key if isinstance(key, str) else key[-1]) != "truncated":
+                    flag = next_tensordict.get(key)
+                    next_tensordict.set(key, flag | arrived.view_as(flag))
         return next_tensordict.set(self.reward_key, reward)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
