@@ -1,7 +1,7 @@
 """Write the tables of results: ``python docs/make_results.py`` after ``results/`` has changed.
 
-Reads ``results/*.json`` (the ``result.json`` of runs) and writes ``docs/results.md`` and the part
-of ``README.md`` between its two marks. A test checks that both are up to date.
+Reads ``results/*.json`` (the ``result.json`` of runs) and writes ``docs/results.md`` and the parts
+of ``README.md`` and ``docs/babyai.md`` between two marks. A test checks that all are up to date.
 """
 
 import functools
@@ -194,13 +194,29 @@ def levels() -> dict[tuple[str, int, str], list[dict[str, Any]]]:
     )
 
 
+@functools.cache
+def level_rows() -> dict[tuple[str, int, str], dict[str, Any]]:
+    """Compare the policies of every level; resampling takes seconds, and three pages show it."""
+    return {of: babyai_row(*of, runs) for of, runs in levels().items()}
+
+
+def strong_levels() -> str:
+    """Return the table of the preset `strong` in BabyAI, as two other pages show it."""
+    known = {of: row for of, row in level_rows().items() if of[0] in LEVELS and of[2] == "strong"}
+    rows = [known[of] for of in sorted(known, key=lambda of: (LEVELS.index(of[0]), of))]
+    return (
+        f"\n{markdown_table([{k: v for k, v in row.items() if k != 'preset'} for row in rows])}\n"
+    )
+
+
 def babyai_section() -> list[str]:
     """Return what was measured in the levels of BabyAI."""
     ran = levels()
     known = {level for level, _, _ in ran}
-    waiting = {(level, 1000, ""): [] for level in LEVELS if level not in known}
+    waiting = {(of, 1000, ""): babyai_row(of, 1000, "", []) for of in LEVELS if of not in known}
     order = [*LEVELS, *sorted(known.difference(LEVELS))]
-    found = sorted({**waiting, **ran}.items(), key=lambda of: (order.index(of[0][0]), *of[0][1:]))
+    rows = {**waiting, **level_rows()}
+    found = sorted(rows, key=lambda of: (order.index(of[0]), *of[1:]))
     return [
         "## BabyAI",
         "Greedy success by BabyAI's own reward in fixed rooms, in percent, with 95% intervals over"
@@ -209,7 +225,7 @@ def babyai_section() -> list[str]:
         " itself is. Minutes are those of one core from recording to the end of the evaluation, the"
         " median of the seeds.",
         f"![Success against the number of demonstrations](assets/{LEARNED.name})",
-        markdown_table([babyai_row(*level, runs) for level, runs in found]),
+        markdown_table([rows[of] for of in found]),
         *([commands_note(ran.values())] if ran else []),
     ]
 
@@ -225,8 +241,14 @@ def babyai_row(level: str, n: int, preset: str, runs: list[dict[str, Any]]) -> d
     if row["phase 2"] != "not run":
         both = (outcomes(runs, name) for name in ("phase1", "phase2"))
         row["gain, points"] = brief(paired_difference(*both))
-    row["minutes"] = round(median(run["seconds"] for run in runs) / 60) if runs else "not run"
+    row["minutes"] = round(median(map(minutes, runs))) if runs else "not run"
     return row
+
+
+def minutes(run: dict[str, Any]) -> float:
+    """Return how long the method and its evaluation took, without the references."""
+    aside = ("imitate_truth", "evaluate_references")
+    return (run["seconds"] - sum(run["stages"].get(stage, 0.0) for stage in aside)) / 60
 
 
 def level_rates(runs: list[dict[str, Any]]) -> dict[str, Rate]:
@@ -343,18 +365,24 @@ def page(found: list[dict[str, Any]]) -> str:
 
 
 def readme(text: str) -> str:
-    """Return the README with its table of results renewed."""
+    """Return the README with its tables of studies and of BabyAI renewed."""
     shown = ("task", "demonstrations", "preset", "held out", "seeds", "phase 1", "phase 2")
     against = ("over continued", "over cloned")
     rows = [{name: row[name] for name in (*shown, *against)} for row in study_rows()]
-    return renewed(text, "results", f"\n{markdown_table(rows)}\n")
+    text = renewed(text, "results", f"\n{markdown_table(rows)}\n")
+    return renewed(text, "babyai", strong_levels())
 
 
 def written() -> dict[Path, str]:
     """Return what each file should say."""
     found = runs()
     path = ROOT / "README.md"
-    return {ROOT / "docs" / "results.md": page(found), path: readme(path.read_text())}
+    levelled = ROOT / "docs" / "babyai.md"
+    return {
+        ROOT / "docs" / "results.md": page(found),
+        path: readme(path.read_text()),
+        levelled: renewed(levelled.read_text(), "babyai", strong_levels()),
+    }
 
 
 def main() -> None:

@@ -89,7 +89,8 @@ def test_levels_of_babyai_are_compared_with_their_references(tmp_path, monkeypat
             "seed": 0,
         },
         "results": results,
-        "seconds": 725.0,
+        "seconds": 755.0,
+        "stages": {"imitate": 725.0, "imitate_truth": 30.0},
         "command": "ifo-grounding run study world=babyai",
         "provenance": {"commit": "abc"},
     }
