@@ -197,7 +197,8 @@ def levels() -> dict[tuple[str, int, str], list[dict[str, Any]]]:
 @functools.cache
 def level_rows() -> dict[tuple[str, int, str], dict[str, Any]]:
     """Compare the policies of every level; resampling takes seconds, and three pages show it."""
-    return {of: babyai_row(*of, runs) for of, runs in levels().items()}
+    measured = level_rates()
+    return {of: babyai_row(*of, runs, measured[of]) for of, runs in levels().items()}
 
 
 def strong_levels() -> str:
@@ -213,7 +214,7 @@ def babyai_section() -> list[str]:
     """Return what was measured in the levels of BabyAI."""
     ran = levels()
     known = {level for level, _, _ in ran}
-    waiting = {(of, 1000, ""): babyai_row(of, 1000, "", []) for of in LEVELS if of not in known}
+    waiting = {(of, 1000, ""): babyai_row(of, 1000, "", [], {}) for of in LEVELS if of not in known}
     order = [*LEVELS, *sorted(known.difference(LEVELS))]
     rows = {**waiting, **level_rows()}
     found = sorted(rows, key=lambda of: (order.index(of[0]), *of[1:]))
@@ -230,11 +231,12 @@ def babyai_section() -> list[str]:
     ]
 
 
-def babyai_row(level: str, n: int, preset: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
+def babyai_row(
+    level: str, n: int, preset: str, runs: list[dict[str, Any]], measured: dict[str, Rate]
+) -> dict[str, Any]:
     """Compare both phases in one level with their references."""
     row: dict[str, Any] = {"level": level, "demonstrations": f"{n:,}", "preset": preset}
     row["seeds"] = len(runs)
-    measured = level_rates(runs)
     for title in BABYAI_POLICIES:
         row[title] = brief(measured[title]) if title in measured else "not run"
     row["gain, points"] = "not run"
@@ -251,21 +253,25 @@ def minutes(run: dict[str, Any]) -> float:
     return (run["seconds"] - sum(run["stages"].get(stage, 0.0) for stage in aside)) / 60
 
 
-def level_rates(runs: list[dict[str, Any]]) -> dict[str, Rate]:
-    """Return how often each policy that was run with every seed succeeds in a level."""
+@functools.cache
+def level_rates() -> dict[tuple[str, int, str], dict[str, Rate]]:
+    """Return of every level how often each policy that was run with every seed succeeds."""
     return {
-        title: two_level_bootstrap(outcomes(runs, name))
-        for title, name in BABYAI_POLICIES.items()
-        if runs and all(name in run["results"] for run in runs)
+        of: {
+            title: two_level_bootstrap(outcomes(runs, name))
+            for title, name in BABYAI_POLICIES.items()
+            if all(name in run["results"] for run in runs)
+        }
+        for of, runs in levels().items()
     }
 
 
 def babyai_picture() -> Figure:
     """Draw success against the number of demonstrations, of the preset `strong`."""
     panels: dict[str, dict[str, dict[int, Rate]]] = {level: {} for level in LEVELS}
-    for (level, n, preset), runs in sorted(levels().items()):
+    for (level, n, preset), rates in sorted(level_rates().items()):
         if preset == "strong" and level in panels:
-            for title, rate in level_rates(runs).items():
+            for title, rate in rates.items():
                 panels[level].setdefault(title, {})[n] = rate
     bots = {level: curves.pop("bot", {}) for level, curves in panels.items()}
     return rates_by_number(

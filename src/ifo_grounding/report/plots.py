@@ -56,8 +56,8 @@ def _percent(axes: Axes, low: float = 0.0) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
 
 
-def _legend(axes: Axes, **options: Any) -> None:
-    axes.legend(frameon=False, labelcolor=LIGHT["ink"], fontsize=9, **options)
+def _legend(of: Axes | Figure, **options: Any) -> None:
+    of.legend(frameon=False, labelcolor=LIGHT["ink"], fontsize=9, **options)
 
 
 def smoothed(values: ArrayLike, span: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.report.plots import _dress, _figure, _percent
+from ifo_grounding.report.plots import _dress, _figure, _legend, _percent
 from ifo_grounding.report.theme import LIGHT, PALETTE
 from ifo_grounding.stats import Rate
 
@@ -96,7 +96,10 @@ def rates_by_number(
         axes.set_xscale("log")
         for name, curve in curves.items():
             place = names.index(name)
-            _curve(axes, name, curve, PALETTE[place % len(PALETTE)], 1 + 0.03 * place)
+            ordered = sorted(curve.items())
+            aside = 1 + 0.03 * place  # so that no interval hides another
+            numbered = [(aside * number, rate) for number, rate in ordered]
+            _with_intervals(axes, numbered, PALETTE[place % len(PALETTE)], name)
         for name, rate in (references or {}).get(title, {}).items():
             axes.axhline(rate, color=LIGHT["faint"], linestyle="--", linewidth=1.2, label=name)
         axes.set_xticks(numbers, [f"{number:,}" for number in numbers])
@@ -107,23 +110,23 @@ def rates_by_number(
     for axes in grid[0]:
         handles, labels = axes.get_legend_handles_labels()
         shown = dict(zip(labels, handles, strict=True)) | shown
-    figure.legend(
-        shown.values(),
-        shown.keys(),
+    _legend(
+        figure,
+        handles=list(shown.values()),
+        labels=list(shown),
         loc="outside lower center",
         ncols=len(shown),
-        frameon=False,
-        labelcolor=LIGHT["ink"],
-        fontsize=9,
     )
     return figure
 
 
-def _curve(axes: Axes, name: str, curve: Mapping[int, Rate], colour: str, aside: float) -> None:
-    numbers = sorted(curve)
-    rates = [curve[number] for number in numbers]
+def _with_intervals(
+    axes: Axes, placed: Sequence[tuple[float, Rate]], colour: str, label: str = ""
+) -> None:
+    """Draw a line through rates, each at its place, with their intervals."""
+    rates = [rate for _, rate in placed]
     axes.errorbar(
-        [aside * number for number in numbers],  # so that no interval hides another
+        [place for place, _ in placed],
         [rate.rate for rate in rates],
         yerr=[[r.rate - r.low for r in rates], [r.high - r.rate for r in rates]],
         color=colour,
@@ -131,7 +134,7 @@ def _curve(axes: Axes, name: str, curve: Mapping[int, Rate], colour: str, aside:
         marker="o",
         ms=5,
         capsize=3,
-        label=name,
+        label=label,
     )
 
 
@@ -152,20 +155,7 @@ def reliability_diagram(bins: Sequence[tuple[float, Rate]], *, title: str = "") 
     axes = grid[0, 0]
     _dress(axes, title, "said", "came true", grid="both")
     axes.plot([0, 1], [0, 1], color=LIGHT["faint"], linestyle="--", linewidth=1.2)
-    said = [place for place, _ in bins]
-    true = [rate.rate for _, rate in bins]
-    below = [rate.rate - rate.low for _, rate in bins]
-    above = [rate.high - rate.rate for _, rate in bins]
-    axes.errorbar(
-        said,
-        true,
-        yerr=[below, above],
-        color=PALETTE[0],
-        linewidth=1.8,
-        marker="o",
-        ms=5,
-        capsize=3,
-    )
+    _with_intervals(axes, bins, PALETTE[0])
     for place, rate in bins:
         text = f"{rate.count:,}"
         axes.annotate(
