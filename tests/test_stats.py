@@ -106,6 +106,22 @@ def test_bootstrap_never_gives_an_empty_interval():
     assert rate.low == wilson(300, 300).low < 1.0
 
 
+@pytest.mark.parametrize("shared", [True, False])
+def test_bootstrap_draws_as_one_by_one_would(shared):
+    # Drawing scenes by how often each pattern of outcomes occurs against drawing every scene.
+    rng = np.random.default_rng(2)
+    values = rng.random((3, 60)) < np.array([[0.5], [0.7], [0.9]])
+    means = []
+    for _ in range(20_000):
+        seed = rng.integers(3, size=3)
+        scene = rng.integers(60, size=(1 if shared else 3, 60))
+        means.append(values[seed[:, None], scene].mean())
+    rate = two_level_bootstrap(values, resamples=20_000, shared_scenes=shared)
+    low, high = np.quantile(means, (0.025, 0.975))
+    assert rate.low == pytest.approx(low, abs=0.012)  # two steps of 1 / 180
+    assert rate.high == pytest.approx(high, abs=0.012)
+
+
 def test_bootstrap_is_a_function_of_its_seed():
     outcomes = np.random.default_rng(1).random((4, 50)) < 0.6
     assert two_level_bootstrap(outcomes, seed=3) == two_level_bootstrap(outcomes, seed=3)
