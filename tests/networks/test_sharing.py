@@ -132,6 +132,8 @@ def test_what_cannot_be_shared_or_found_is_said(tmp_path, monkeypatch):
         from_pretrained("runs/policy")
     with pytest.raises(UserError, match=r"neither a folder .*HFValidationError"):
         from_pretrained("some--one/policy")
+    with pytest.raises(UserError, match=r"mine is written, but a/policy on .*hf auth login"):
+        save_pretrained(make_policy(SHAPES), tmp_path / "mine", hub_id="a/policy")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(UserError, match=r"ifo-grounding\[hub\]"):
         from_pretrained("someone/something")

@@ -55,7 +55,7 @@ def save_pretrained(
 
     Raises:
         UserError: for a module that no ``make_*`` function built, words that do not fit it, a
-            ``folder`` that is none, or a missing extra.
+            ``folder`` that is none, a missing extra, or where the Hub refuses.
 
     >>> import tempfile
     >>> from ifo_grounding.networks import Shapes, make_policy
@@ -88,14 +88,7 @@ def save_pretrained(
             temporary.write_text(_card(plan, facts or {}), encoding="utf-8")
     save(module, folder / WEIGHTS)
     if hub_id is not None:
-        hub = _hub()
-        hub.create_repo(hub_id, exist_ok=True)
-        hub.upload_folder(
-            repo_id=hub_id,
-            folder_path=str(folder),
-            allow_patterns=[WEIGHTS, WORDS, CARD],
-            delete_patterns=[WORDS],  # where this network has none
-        )
+        _upload(folder, hub_id)
     return folder
 
 
@@ -129,15 +122,36 @@ def from_pretrained(
     return module
 
 
+def _upload(folder: Path, hub_id: str) -> None:
+    hub = _hub()
+    try:
+        hub.create_repo(hub_id, exist_ok=True)
+        hub.upload_folder(
+            repo_id=hub_id,
+            folder_path=str(folder),
+            allow_patterns=[WEIGHTS, WORDS, CARD],
+            delete_patterns=[WORDS],  # where this network has none
+        )
+    except Exception as error:  # the client's and those of its transport, which share no base
+        raise UserError(
+            f"{folder} is written, but {hub_id} on the Hugging Face Hub is not "
+            f"({_first_line(error)}): mend the name or the connection, or log in with "
+            "`hf auth login`, and save again"
+        ) from None
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
+
+
 def _downloaded(hub_id: str) -> Path:
     hub = _hub()
     try:
         return Path(hub.snapshot_download(hub_id, allow_patterns=[WEIGHTS, WORDS, CARD]))
     except (OSError, ValueError) as error:  # what all errors of the Hub are
-        reason = (str(error) or "no reason given").splitlines()[0]
         raise UserError(
             f"{hub_id} is neither a folder nor a repository of the Hugging Face Hub that can be "
-            f"reached ({type(error).__name__}: {reason}): mend the name, or the connection"
+            f"reached ({_first_line(error)}): mend the name, or the connection"
         ) from None
 
 
