@@ -21,15 +21,17 @@ from ifo_grounding.report import (
     results_rows,
     save_figure,
 )
+from ifo_grounding.report.paper import EPISODES, TABLE_2
 from ifo_grounding.report.results import brief, commands_note, read_results, restored
 from ifo_grounding.report.results import unpacked as outcomes
 from ifo_grounding.report.tables import renewed
-from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap
+from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap, wilson
 from ifo_grounding.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "assets" / "studies.png"
 LEARNED = PICTURE.with_name("babyai.png")
+EFFICIENCY = PICTURE.with_name("efficiency.png")
 HACKED = ROOT / "results" / "study" / "move-200-film-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
@@ -37,6 +39,8 @@ NAMES = {
     "cloned": "accepted rollouts cloned",
     "phase2": "phase 2",
 }
+
+PHASES = ("phase1", "phase2")
 
 BABYAI_POLICIES = {
     "bot": "demonstrator",
@@ -332,10 +336,62 @@ def adjusted(found: dict[Key, list[dict[str, Any]]]) -> list[str]:
     return [f"{corrected[key]:.2g}" for key in found]
 
 
+def efficient() -> dict[str, dict[int, dict[str, Rate]]]:
+    """Return of each task what `strong` reaches by number of demonstrations, two or more."""
+    found: dict[str, dict[int, dict[str, Rate]]] = {}
+    for (task, n, kind, held_out), runs in practised().items():
+        if kind == "strong" and not held_out:
+            rates = {name: two_level_bootstrap(outcomes(runs, name)) for name in PHASES}
+            found.setdefault(task, {})[n] = rates
+    return {task: dict(sorted(by.items())) for task, by in found.items() if len(by) > 1}
+
+
+def best_of_paper(task: str) -> float:
+    """Return the paper's best rate of a task: after phase 2, with 80,000 demonstrations."""
+    return max(TABLE_2[task]) / 100
+
+
+def efficiency_section() -> list[str]:
+    """Return how success grows with the number of demonstrations."""
+    found = efficient()
+    if not found:
+        return []
+    rows = []
+    for task, numbers in found.items():
+        told = wilson(round(best_of_paper(task) * EPISODES), EPISODES)
+        row = {"task": task, "paper, 80,000": brief(told), "fewest tried": f"{min(numbers):,}"}
+        for name in PHASES:
+            ahead = [n for n, rates in numbers.items() if rates[name].low > told.high]
+            row[f"{NAMES[name]} beats it with"] = f"{min(ahead):,}" if ahead else "none"
+        rows.append(row)
+    return [
+        "## Data efficiency",
+        "The same studies by number of demonstrations, preset `strong`. The dashed line is the"
+        " paper's best policy, after its phase 2 with 80,000 demonstrations.",
+        f"![Success against the number of demonstrations](assets/{EFFICIENCY.name})",
+        "The fewest of the tried numbers of demonstrations with which an interval lies above that"
+        " of the paper, whose rates look like 500 episodes:",
+        markdown_table(rows),
+    ]
+
+
+def efficiency_picture() -> Figure:
+    """Draw success against the number of demonstrations, beside the paper's best."""
+    found = efficient()
+    panels = {
+        task: {NAMES[name]: {n: rates[name] for n, rates in by.items()} for name in PHASES}
+        for task, by in found.items()
+    }
+    references = {task: {"paper, 80,000": best_of_paper(task)} for task in panels}
+    return rates_by_number(panels, references=references)
+
+
 def study_picture() -> Figure:
-    """Draw what the studies compare."""
+    """Draw what the studies compare that ran their controls."""
     groups = {}
     for (task, n, kind, held_out), runs in practised().items():
+        if "cloned" not in runs[0]["results"]:
+            continue
         known = [name for name in NAMES if all(name in run["results"] for run in runs)]
         aside = f", {held_out:.0%} held out" if held_out else ""
         title = f"{task}, {n:,} demonstrations{aside}, {kind}, seeds: {len(runs)}"
@@ -355,7 +411,7 @@ def page(found: list[dict[str, Any]]) -> str:
         "Every number here comes from a file under `results/`, which holds all options, the seed,"
         " the commit and the machine. `python docs/make_results.py` writes this page from them.",
     ]
-    parts += study_section() + babyai_section()
+    parts += study_section() + efficiency_section() + babyai_section()
     parts += variant_section() + module_section() + imitation_section()
     for run in found:
         made = run["provenance"]
@@ -372,9 +428,10 @@ def page(found: list[dict[str, Any]]) -> str:
 
 def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
-    shown = ("task", "demonstrations", "preset", "held out", "seeds", "phase 1", "phase 2")
+    shown = ("task", "demonstrations", "seeds", "phase 1", "phase 2", "gain, points")
     against = ("over continued", "over cloned")
-    rows = [{name: row[name] for name in (*shown, *against)} for row in study_rows()]
+    strong = [row for row in study_rows() if row["preset"] == "strong"]
+    rows = [{name: row[name] for name in (*shown, *against)} for row in strong]
     text = renewed(text, "results", f"\n{markdown_table(rows)}\n")
     return renewed(text, "babyai", strong_levels())
 
@@ -397,6 +454,8 @@ def main() -> None:
             temporary.write_text(text)
     if studies():
         save_figure(study_picture(), PICTURE)
+    if efficient():
+        save_figure(efficiency_picture(), EFFICIENCY)
     if levels():
         save_figure(babyai_picture(), LEARNED)
     if (hacked := hacking_picture()) is not None:

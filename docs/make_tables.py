@@ -12,6 +12,7 @@ from typing import Any
 from ifo_grounding.evaluation.endings import ENDINGS, SHARED
 from ifo_grounding.files import atomic_write
 from ifo_grounding.report import markdown_table
+from ifo_grounding.report.paper import EPISODES, TABLE_2, TABLE_3, TABLE_4
 from ifo_grounding.report.results import brief, commands_note, read_results, restored
 from ifo_grounding.report.results import unpacked as outcomes
 from ifo_grounding.report.tables import renewed
@@ -28,19 +29,6 @@ PARTS = ROOT / "results" / "zero-shot"
 RECOMBINED = ROOT / "results" / "recombined"
 ABLATIONS = ROOT / "results" / "ablations"
 PRESETS = ("paper", "film", "strong")
-PAPER_EPISODES = 500
-"""The paper's rates are multiples of 0.2%: they look like this many episodes each."""
-TABLE_2 = {
-    "move": (76.6, 79.4, 78.4),
-    "move-udlr": (69.0, 73.4, 72.4),
-    "pick": (13.0, 15.0, 15.4),
-    "pick-out": (32.8, 34.0, 34.6),
-    "pick-udlr": (22.6, 26.0, 24.8),
-}
-TABLE_3 = dict(zip(TASKS, (91.725, 81.145, 90.190, 77.940, 76.810), strict=True))
-TABLE_4 = dict(
-    zip(TASKS, ((62.8, 68.4), (56.8, 60.6), (11.2, 14.6), (27.4, 29.8), (19.8, 21.0)), strict=True)
-)
 ERRORS, FAILURES = REASONS[1:], ENDINGS[1:]
 NOT_RUN = "not run"
 
@@ -72,7 +60,7 @@ def mean(shares: list[float], digits: int = 2) -> str:
 
 def of_paper(percent: float) -> str:
     """Return a rate of the paper with the interval that its number of episodes implies."""
-    return brief(wilson(round(percent / 100 * PAPER_EPISODES), PAPER_EPISODES))
+    return brief(wilson(round(percent / 100 * EPISODES), EPISODES))
 
 
 def success_rows(

@@ -75,6 +75,19 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
         assert shown in table
 
 
+def test_the_fewest_demonstrations_that_beat_the_paper_are_found(monkeypatch):
+    script = load_script()
+    rates = {
+        n: dict.fromkeys(script.PHASES, wilson(hits, 1000))
+        for n, hits in {200: 780, 500: 860, 2000: 900}.items()
+    }
+    monkeypatch.setattr(script, "efficient", lambda: {"move": rates})
+    [row] = [line for line in script.efficiency_section()[-1].splitlines() if "| move |" in line]
+    assert row.endswith("| 200 | 500 | 500 |")
+    lines = script.efficiency_picture().axes[0].lines
+    assert [0.794, 0.794] in [list(line.get_ydata()) for line in lines]
+
+
 def test_levels_of_babyai_are_compared_with_their_references(tmp_path, monkeypatch):
     script = load_script()
     folder = tmp_path / "results" / "babyai"

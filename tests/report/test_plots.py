@@ -173,6 +173,7 @@ def test_rates_by_number_shows_each_curve_in_its_panel():
     assert bars.get_segments()[0][:, 1].tolist() == pytest.approx([few.low, few.high])
     assert [label.get_text() for label in second.get_xticklabels()] == ["500", "2,000"]
     assert second.lines[0].get_ydata() == [0.13, 0.13]
+    assert second.get_ylim()[0] < 0.13
     with pytest.raises(UserError, match="at least one curve"):
         rates_by_number({"move": {"phase 1": {}}})
 

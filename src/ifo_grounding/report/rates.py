@@ -89,7 +89,8 @@ def rates_by_number(
     if not any(every):
         raise UserError("rates_by_number needs at least one curve with one rate")
     numbers = sorted({number for curve in every for number in curve})
-    low = min(rate.low for curve in every for rate in curve.values())
+    lines = [rate for known in (references or {}).values() for rate in known.values()]
+    low = min([*lines, *(rate.low for curve in every for rate in curve.values())])
     figure, grid = _figure(1.6 + 2.8 * len(panels), 3.4, columns=len(panels))
     for axes, (title, curves) in zip(grid[0], panels.items(), strict=True):
         _dress(axes, title, x)

@@ -56,7 +56,12 @@ def accepted_steps(
     collector.shutdown(close_env=False)
     chosen: TensorDictBase = torch.cat(kept)
     if not len(chosen):
-        raise UserError(f"the judge accepted no episode of {iterations * env.batch_size.numel()}")
+        raise UserError(
+            f"the judge accepted no episode of {iterations} rounds in {env.batch_size.numel()} "
+            f"environments, at a learned return of {threshold:g} or more: lower the "
+            "threshold (controls.accept), train policy and judge for longer, or do without cloning "
+            "(controls.run=false)"
+        )
     return chosen
 
 
