@@ -1,5 +1,6 @@
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -132,8 +133,42 @@ def test_what_cannot_be_shared_or_found_is_said(tmp_path, monkeypatch):
         from_pretrained("runs/policy")
     with pytest.raises(UserError, match=r"neither a folder .*HFValidationError"):
         from_pretrained("some--one/policy")
-    with pytest.raises(UserError, match=r"mine is written, but a/policy on .*hf auth login"):
+    with pytest.raises(UserError, match=r"a/policy could not be sent .*hf auth login"):
         save_pretrained(make_policy(SHAPES), tmp_path / "mine", hub_id="a/policy")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(UserError, match=r"ifo-grounding\[hub\]"):
         from_pretrained("someone/something")
+
+
+def test_the_hub_gets_the_folder_in_one_commit(tmp_path, monkeypatch):
+    sent = {}
+
+    def upload(api, **options):
+        folder = Path(options["folder_path"])
+        files = {path.name: path.read_bytes() for path in folder.iterdir()}
+        sent.update(options, files=files)
+        return "https://a.commit"
+
+    def create(api, repo_id, **options):
+        sent["created"] = options
+        return SimpleNamespace(repo_id=repo_id)
+
+    monkeypatch.setattr("huggingface_hub.HfApi.create_repo", create)
+    monkeypatch.setattr("huggingface_hub.HfApi.upload_folder", upload)
+    policy = make_policy(SHAPES, seed=0)
+    save_pretrained(
+        policy,
+        tmp_path,
+        vocabulary=VOCABULARY,
+        hub_id="a/policy",
+        private=True,
+        commit_message="first",
+    )
+    assert sent["files"] == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert sent["repo_id"] == "a/policy" and sent["commit_message"] == "first"
+    assert sent["created"] == {"private": True, "exist_ok": True}
+    assert set(sent["allow_patterns"]) == set(sent["files"])
+    policy.push_to_hub("a/other", facts={"Task": "move"})
+    assert sent["repo_id"] == "a/other" and b"| Task | move |" in sent["files"]["README.md"]
+    with pytest.raises(TypeError, match="privat"):
+        policy.push_to_hub("a/other", privat=True)

@@ -58,7 +58,7 @@ class Shareable(nn.Module):
         return save_pretrained(self, folder, **options)
 
     def push_to_hub(self, hub_id: str, **options: Any) -> None:
-        """Send it to the Hugging Face Hub as ``user/name``, with options of the former."""
+        """Send it to the Hugging Face Hub as ``user/name``, with the same options."""
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder, hub_id=hub_id, **options)
 

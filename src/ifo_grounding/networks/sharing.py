@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ifo_grounding.tasks.vocabulary import Vocabulary
 WEIGHTS = "network.safetensors"
 WORDS = "vocabulary.json"
 CARD = "README.md"
+FILES = [WEIGHTS, WORDS, CARD]
 LIBRARY = "library_name: ifo-grounding"
 ROLES = {
     "policy": "chooses an action for an image and an instruction",
@@ -37,6 +39,7 @@ def save_pretrained(
     vocabulary: Vocabulary | None = None,
     facts: Mapping[str, object] | None = None,
     hub_id: str | None = None,
+    **hub: Any,
 ) -> Path:
     """Write a network as a folder with a model card, and send it to the Hugging Face Hub if asked.
 
@@ -49,6 +52,8 @@ def save_pretrained(
             :func:`from_pretrained` gives them back.
         facts: what the card says, such as ``{"Task": "move", "Success": "99.7% [99.5, 99.8]"}``.
         hub_id: ``user/name`` on the Hub; needs the extra ``hub`` and an account that is logged in.
+        hub: for ``push_to_hub`` of ``huggingface_hub.ModelHubMixin``, such as ``private``,
+            ``commit_message``, ``branch``, ``create_pr`` or ``token``.
 
     Returns:
         The folder.
@@ -88,12 +93,15 @@ def save_pretrained(
             temporary.write_text(_card(plan, facts or {}), encoding="utf-8")
     save(module, folder / WEIGHTS)
     if hub_id is not None:
-        _upload(folder, hub_id)
+        _upload(folder, hub_id, hub)
     return folder
 
 
 def from_pretrained(
-    source: str | Path, device: torch.device | str | None = None, kind: str | None = None
+    source: str | Path,
+    device: torch.device | str | None = None,
+    kind: str | None = None,
+    **hub: Any,
 ) -> Any:
     """Load a network that :func:`save_pretrained` wrote.
 
@@ -101,6 +109,8 @@ def from_pretrained(
         source: its folder, or ``user/name`` on the Hugging Face Hub (extra ``hub``).
         device: where to build it.
         kind: the kind that is expected, such as ``"policy"``; None allows any.
+        hub: for ``huggingface_hub.snapshot_download``, such as ``revision``, ``cache_dir``,
+            ``token`` or ``local_files_only``.
 
     Returns:
         The network, in eval mode, with the words of its token ids as ``vocabulary``, or None.
@@ -115,39 +125,52 @@ def from_pretrained(
     if not folder.is_dir():
         if str(source).count("/") != 1 or str(source).startswith((".", "/", "~")):
             raise UserError(f"{source} is no folder; on the Hub a network is called user/name")
-        folder = _downloaded(str(source))
+        folder = _downloaded(str(source), hub)
     module = load(folder / WEIGHTS, device=device, kind=kind)
     words = folder / WORDS
     module.vocabulary = _vocabulary(words, plan_of(module).shapes) if words.exists() else None
     return module
 
 
-def _upload(folder: Path, hub_id: str) -> None:
-    hub = _hub()
+def _upload(folder: Path, hub_id: str, options: dict[str, Any]) -> None:
+    """Send the files of a network in one commit; those of another that was there go with it."""
     try:
-        hub.create_repo(hub_id, exist_ok=True)
-        hub.upload_folder(
-            repo_id=hub_id,
-            folder_path=str(folder),
-            allow_patterns=[WEIGHTS, WORDS, CARD],
-            delete_patterns=[WORDS],  # where this network has none
+        _mixin()(folder).push_to_hub(
+            hub_id, allow_patterns=FILES, delete_patterns=[WORDS], **options
         )
+    except TypeError:  # an option that there is not
+        raise
     except Exception as error:  # the client's and those of its transport, which share no base
         raise UserError(
-            f"{folder} is written, but {hub_id} on the Hugging Face Hub is not "
-            f"({_first_line(error)}): mend the name or the connection, or log in with "
-            "`hf auth login`, and save again"
+            f"{hub_id} could not be sent to the Hugging Face Hub ({_first_line(error)}): mend the "
+            "name or the connection, or log in with `hf auth login`"
         ) from None
+
+
+def _mixin() -> Any:
+    """Return the Hub's mixin for a folder that is written already."""
+    mixin: Any = _hub().ModelHubMixin
+
+    class Shared(mixin):
+        def __init__(self, folder: Path) -> None:
+            self.folder = folder
+
+        def _save_pretrained(self, save_directory: Path) -> None:
+            for name in FILES:
+                if (self.folder / name).exists():
+                    shutil.copy(self.folder / name, save_directory / name)
+
+    return Shared
 
 
 def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
 
 
-def _downloaded(hub_id: str) -> Path:
+def _downloaded(hub_id: str, options: dict[str, Any]) -> Path:
     hub = _hub()
     try:
-        return Path(hub.snapshot_download(hub_id, allow_patterns=[WEIGHTS, WORDS, CARD]))
+        return Path(hub.snapshot_download(hub_id, allow_patterns=FILES, **options))
     except (OSError, ValueError) as error:  # what all errors of the Hub are
         raise UserError(
             f"{hub_id} is neither a folder nor a repository of the Hugging Face Hub that can be "
