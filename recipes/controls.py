@@ -115,6 +115,9 @@ class Both:
         self.rollouts = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rollouts)))
         self.rollouts.extend(rollouts)
 
+    def __len__(self) -> int:
+        return len(self.demonstrations) + len(self.rollouts)
+
     def sample(self, batch_size: int) -> TensorDict:
         """Return transitions, [batch_size]."""
         entries = ("pixels", "instruction", "action")

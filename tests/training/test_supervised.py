@@ -120,10 +120,26 @@ def test_the_schedule_warms_up_and_ends_near_zero():
     assert FitConfig(schedule="constant").rate(1234) == 1.0
 
 
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"batch_size": -1}, {"schedule": "linear"}])
+@pytest.mark.parametrize(
+    "wrong", [{"steps": 0}, {"batch_size": -1}, {"schedule": "linear"}, {"prior": -1}]
+)
 def test_impossible_configs_are_refused(wrong):
     with pytest.raises(UserError):
         FitConfig(**wrong)
+
+
+def test_the_prior_counts_for_the_more_the_fewer_the_samples(buffer):
+    def size_of_weights(samples, prior):
+        loss = imitation()
+        few = TensorDictReplayBuffer(storage=LazyTensorStorage(samples))
+        few.extend(buffer[:samples])
+        fit(loss, few, FitConfig(steps=40, batch_size=32, lr=5e-3, prior=prior), seed=0)
+        return sum(float(weight.square().sum()) for weight in loss.parameters())
+
+    assert size_of_weights(16, prior=200) < size_of_weights(256, prior=200)
+    assert size_of_weights(256, prior=200) < size_of_weights(256, prior=0)
+    assert FitConfig(weight_decay=0.5, prior=1).decay(10) == 0.5
+    assert FitConfig(prior=1).decay(0) == 1.0
 
 
 def test_only_losses_are_minimised():

@@ -54,6 +54,9 @@ class FitConfig:
     """Share of the steps that warm up, with ``cosine``."""
     weight_decay: float = 0.0
     """Decoupled weight decay; 0 makes AdamW the paper's Adam."""
+    prior: float = 0.0
+    """Weight decay is this over the number of samples, where that is more than ``weight_decay``: a
+    Gaussian prior on weights, which counts for the more the less there is to learn from."""
     grad_clip: float = 1.0
     """Largest norm of the gradient."""
     iteration: int = 50
@@ -68,6 +71,9 @@ class FitConfig:
         for name in ("steps", "batch_size", "iteration", "validate_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("weight_decay", "prior"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
         if self.schedule not in ("constant", "cosine"):
             raise UserError(f"unknown schedule {self.schedule!r}: choose constant or cosine")
 
@@ -79,6 +85,14 @@ class FitConfig:
         if step < warmup:
             return (step + 1) / warmup
         return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, self.steps - warmup)))
+
+    def decay(self, samples: int) -> float:
+        """Return the weight decay for a number of samples.
+
+        >>> FitConfig(weight_decay=0.01, prior=2000).decay(1000)
+        2.0
+        """
+        return max(self.weight_decay, self.prior / max(1, samples))
 
 
 def make_optimizer(
@@ -130,7 +144,8 @@ def fit(
     Args:
         loss: a LossModule; entries of its output named ``loss_*`` are minimised, others are
             metrics. Where it has ``set_progress``, it is told the share of steps done.
-        buffer: ``sample(batch_size)`` gives the loss its input.
+        buffer: ``sample(batch_size)`` gives the loss its input; ``len`` of it decides how much
+            ``config.prior`` counts.
         config: steps, batch size, learning rate.
         seed: all randomness is a function of it, of ``name`` and of the iteration.
         name: names the stream of randomness, and the progress bar.
@@ -148,7 +163,8 @@ def fit(
     Returns:
         Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
     """
-    optimizer = make_optimizer(loss.parameters(), config.lr, config.weight_decay)
+    decay = config.decay(len(buffer)) if config.prior else config.weight_decay
+    optimizer = make_optimizer(loss.parameters(), config.lr, decay)
     saved = None
     if checkpoint:
         parts: dict[str, Any] = {"loss": loss, "optimizer": optimizer}
