@@ -171,7 +171,7 @@ def test_rates_by_number_shows_each_curve_in_its_panel():
     curve, _, (bars,) = first.containers[0]
     assert curve.get_xydata().tolist() == [[500, 0.6], [2000, 0.8]]
     assert bars.get_segments()[0][:, 1].tolist() == pytest.approx([few.low, few.high])
-    assert [label.get_text() for label in second.get_xticklabels()] == ["500", "2,000"]
+    assert [label.get_text() for label in second.get_xticklabels()] == ["500", "2K"]
     assert second.lines[0].get_ydata() == [0.13, 0.13]
     assert second.get_ylim()[0] < 0.13
     with pytest.raises(UserError, match="at least one curve"):

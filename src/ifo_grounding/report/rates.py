@@ -103,7 +103,7 @@ def rates_by_number(
             _with_intervals(axes, numbered, PALETTE[place % len(PALETTE)], name)
         for name, rate in (references or {}).get(title, {}).items():
             axes.axhline(rate, color=LIGHT["faint"], linestyle="--", linewidth=1.2, label=name)
-        axes.set_xticks(numbers, [f"{number:,}" for number in numbers])
+        axes.set_xticks(numbers, [_short(number) for number in numbers])
         axes.set_xlim(0.8 * numbers[0], 1.25 * numbers[-1])
         axes.minorticks_off()
         _percent(axes, max(0.0, 0.1 * math.floor(10 * low)))
@@ -119,6 +119,11 @@ def rates_by_number(
         ncols=len(shown),
     )
     return figure
+
+
+def _short(number: int) -> str:
+    """Return 500 or 2K, so that labels do not run into each other."""
+    return f"{number / 1000:g}K" if number >= 1000 else str(number)
 
 
 def _with_intervals(
