@@ -6,11 +6,13 @@ from ifo_grounding.networks import (
     CellCount,
     CellLinear,
     GatedAttention,
+    GRUInstructionEncoder,
     ResidualBlock,
     ResidualFiLM,
     SpatialReadout,
     pool_cells,
 )
+from ifo_grounding.tasks import VOCABULARY, grammar
 
 
 def test_gated_attention_is_the_papers_equation():
@@ -22,6 +24,14 @@ def test_gated_attention_is_the_papers_equation():
     gated = gate(image, torch.tensor([[0.0, 2.0]]))
     expected = image * torch.tensor([0.5, 0.8807970779778823, 0.7310585786300049]).view(1, 3, 1, 1)
     torch.testing.assert_close(gated, expected)
+
+
+def test_gates_differ_from_one_sentence_to_another_to_begin_with():
+    torch.manual_seed(0)
+    encoder = GRUInstructionEncoder(len(VOCABULARY), embedding=8, hidden=64)
+    gate = GatedAttention(encoder.size, 32)
+    gates = gate(torch.ones(1, 32, 1, 1), encoder(grammar("move").tokens.flatten(0, -2)))
+    assert gates.std(0).mean() > 0.1
 
 
 def test_film_block_by_hand():

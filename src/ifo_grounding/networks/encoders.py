@@ -228,6 +228,10 @@ def over_words(layer: nn.Conv1d, words: Tensor) -> Tensor:
     return out.squeeze(-2).movedim(-2, -1)
 
 
+WORD_GAIN = 2.0
+"""Standard deviation of what a GRU hears of a word to begin with, by that of its embedding."""
+
+
 class GRUInstructionEncoder(InstructionEncoder):
     """Word embeddings and a bidirectional GRU (the paper's experimental settings).
 
@@ -237,6 +241,9 @@ class GRUInstructionEncoder(InstructionEncoder):
     The recurrence is written out, where ``nn.GRU`` would do, because packed sequences do not work
     under ``torch.vmap``, which TorchRL's value estimators use.
 
+    It begins with orthogonal recurrences (Saxe et al. 2014) and large weights of words:
+    PyTorch's own, which are smaller, would make all sentences nearly the same to begin with.
+
     >>> encoder = GRUInstructionEncoder(vocabulary_size=40, embedding=8, hidden=64)
     >>> encoder(torch.randint(40, (5, 16))).shape
     torch.Size([5, 128])
@@ -244,13 +251,14 @@ class GRUInstructionEncoder(InstructionEncoder):
 
     def __init__(self, vocabulary_size: int, embedding: int, hidden: int) -> None:
         super().__init__(vocabulary_size, embedding, hidden)
-        bound = 1 / math.sqrt(hidden)
         self.input_weight = nn.Parameter(torch.empty(2, embedding, 3 * hidden))
-        self.input_bias = nn.Parameter(torch.empty(2, 1, 3 * hidden))
+        self.input_bias = nn.Parameter(torch.zeros(2, 1, 3 * hidden))
         self.state_weight = nn.Parameter(torch.empty(2, hidden, 3 * hidden))
-        self.state_bias = nn.Parameter(torch.empty(2, 1, 3 * hidden))
-        for weight in (self.input_weight, self.input_bias, self.state_weight, self.state_bias):
-            nn.init.uniform_(weight, -bound, bound)
+        self.state_bias = nn.Parameter(torch.zeros(2, 1, 3 * hidden))
+        nn.init.normal_(self.input_weight, std=WORD_GAIN / math.sqrt(embedding))
+        for way in self.state_weight.detach():
+            for part in way.chunk(3, -1):
+                nn.init.orthogonal_(part)
 
     def _encode(self, tokens: Tensor) -> Tensor:
         """Run the GRU both ways over rows of ids [N, L], of which trailing zeros do not count."""

@@ -8,6 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+GATE_GAIN = 6.0
+"""Standard deviation of a gate's logit to begin with, by that of an instruction's features."""
+
 
 class GatedAttention(nn.Module):
     r"""Gate the channels of a feature map by an instruction (the paper's first equation).
@@ -15,7 +18,8 @@ class GatedAttention(nn.Module):
     .. math:: \text{GA}(s, t) = \text{CNN}(s) \odot h(\text{GRU}(t))
 
     where h is a linear layer with a sigmoid, extended over the height and width of the feature map
-    (Chaplot et al. 2018).
+    (Chaplot et al. 2018). Weights of h begin so large that gates differ from one sentence to
+    another: with PyTorch's own they differ by a hundredth, and learn from it late.
 
     >>> gate = GatedAttention(instruction_size=128, features=32)
     >>> gate(torch.ones(2, 32, 3, 3), torch.zeros(2, 128)).shape
@@ -25,6 +29,8 @@ class GatedAttention(nn.Module):
     def __init__(self, instruction_size: int, features: int) -> None:
         super().__init__()
         self.h = nn.Linear(instruction_size, features)
+        nn.init.normal_(self.h.weight, std=GATE_GAIN / math.sqrt(instruction_size))
+        nn.init.zeros_(self.h.bias)
 
     def forward(self, image: Tensor, instruction: Tensor) -> Tensor:
         """Gate ``image`` [N, F, H, W], i.e. CNN(s), by ``instruction`` [N, D], i.e. GRU(t)."""
