@@ -86,9 +86,9 @@ def study_section() -> list[str]:
         return []
     return [
         "## Studies",
-        "Several training seeds each; greedy success on the same evaluation scenes in percent, with"
-        " 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired by"
-        " scene. Where demonstrations were held out, their likelihood stopped phase 1"
+        "One to five training seeds each; greedy success on the same evaluation scenes in percent,"
+        " with 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired"
+        " by scene. Where demonstrations were held out, their likelihood stopped phase 1"
         " ([too early](#variants-of-phase-1), as it turned out)."
         " `continued` and `cloned` are the [controls](phase2.md#controls). The columns"
         " before the last hold, for each seed, the share of suitable instructions among those"
@@ -172,6 +172,7 @@ def imitation_section() -> list[str]:
                 {
                     "task": task,
                     "demonstrations": f"{n:,}",
+                    "preset": options["network"],
                     "imitation": kind.partition(", ")[2] or kind,
                     "steps": f"{options['imitate']['steps']:,}",
                     "held out": f"{options['imitate']['held_out']:.0%}",
@@ -184,8 +185,8 @@ def imitation_section() -> list[str]:
         return []
     return [
         "## Variants of phase 1",
-        "When to [stop imitating](phase1.md#when-to-stop): success on 4,000 validation scenes, from"
-        " the same labels.",
+        "When to [stop imitating](phase1.md#when-to-stop), and with and without the"
+        " [prior](phase1.md#few-demonstrations): success on 4,000 validation scenes.",
         markdown_table(rows),
         commands_note(found.values()),
     ]
@@ -367,12 +368,23 @@ def efficiency_section() -> list[str]:
     return [
         "## Data efficiency",
         "The same studies by number of demonstrations, preset `strong`. The dashed line is the"
-        " paper's best policy, after its phase 2 with 80,000 demonstrations.",
+        f" paper's best policy, after its phase 2 with 80,000 demonstrations. {with_prior()}",
         f"![Success against the number of demonstrations](assets/{EFFICIENCY.name})",
         "The fewest of the tried numbers of demonstrations with which an interval lies above that"
         " of the paper, whose rates look like 500 episodes:",
         markdown_table(rows),
     ]
+
+
+def with_prior() -> str:
+    """Say which of these studies imitated with the prior, which the first ones did not know."""
+    numbers = {
+        n
+        for (_, n, kind, _), runs in practised().items()
+        if kind == "strong" and runs[0]["options"]["imitate"].get("prior")
+    }
+    told = " and ".join(f"{n:,}" for n in sorted(numbers)) or "none"
+    return f"Imitated with the [prior](phase1.md#few-demonstrations): {told}; the others without."
 
 
 def efficiency_picture() -> Figure:

@@ -195,8 +195,15 @@ def test_an_unknown_command_or_recipe_is_named(recipes, capsys, monkeypatch, arg
     assert printed.count("\n") == 1
 
 
+def test_a_choice_that_a_recipe_has_not_is_named(capsys):
+    assert run("run", "reproduce", "preset=strong") == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("error: reproduce has no option 'preset' (did you mean 'presets'?)")
+    assert printed.count("\n") == 1
+
+
 def test_help_and_version(capsys):
-    assert run() == run("--help") == run("-h") == 0
+    assert run() == run("--help") == run("-h") == run("run", "--help") == 0
     printed = capsys.readouterr().out
     for command in [*cli.COMMANDS, "run"]:
         assert f"\n  {command} " in printed

@@ -161,11 +161,29 @@ def _check_overrides(name: str, overrides: Sequence[Override], several: bool) ->
             groups.append(override)
         elif not override.is_hydra_override():
             values.append(override)
+    for group in groups:
+        if not group.is_sweep_override():
+            _check_group(name, group)
     chosen = [group.input_line or "" for group in groups if not group.is_sweep_override()]
     defaults = compose(name, overrides=chosen)
     choices = [group for group in loader.list_groups("") if group != "hydra"]
     for override in values:
         _check_value(defaults, override, choices)
+
+
+def _check_group(name: str, override: Override) -> None:
+    """Refuse a choice that other recipes offer and this one does not."""
+    from hydra import compose
+    from hydra.errors import HydraException
+
+    try:
+        compose(name, overrides=[override.input_line or ""])
+    except HydraException:
+        group, names = override.key_or_group, list(map(str, compose(name)))
+        close = difflib.get_close_matches(group, names, n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        listed = ", ".join(names)
+        raise UserError(f"{name} has no option {group!r}{hint}: it has {listed}") from None
 
 
 def _check_choices(override: Override, allowed: list[str]) -> None:

@@ -29,7 +29,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     command, *rest = (list(sys.argv[1:] if arguments is None else arguments)) or ["--help"]
     with one_line_errors():
-        if command in ("-h", "--help", "help"):
+        asked = rest if command == "run" else [command]
+        if asked[:1] and asked[0] in ("-h", "--help", "help"):
             print(usage())
         elif command == "--version":
             print("ifo-grounding", version("ifo-grounding"))
@@ -45,7 +46,7 @@ def usage() -> str:
     lines += [f"  {name:<{width}}  {text}" for name, (_, text) in COMMANDS.items()]
     lines += [f"  {'run':<{width}}  any recipe by its name: ifo-grounding run <recipe>", ""]
     lines += ["recipes: " + ", ".join(recipe_names()), ""]
-    lines += ["ifo-grounding <command> --help lists the options and values of a command."]
+    lines += ["ifo-grounding <command> --help and ifo-grounding run <recipe> --help list options."]
     return "\n".join(lines)
 
 
