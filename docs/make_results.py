@@ -93,8 +93,9 @@ def study_section() -> list[str]:
         " `continued` and `cloned` are the [controls](phase2.md#controls). The columns"
         " before the last hold, for each seed, the share of suitable instructions among those"
         " chosen, of states served, and of states that any instruction of the pool suits, by the"
-        " oracle: the most that could be served. p is that of no gain, corrected (Holm) for the"
-        " tasks with as many demonstrations.",
+        " oracle: the most that could be served. p is that of no gain, by a"
+        " [t test over seeds](evaluation.md#intervals), of one seed by McNemar's, corrected (Holm)"
+        " for the tasks with as many demonstrations.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table(rows),
         commands_note(practised().values()),

@@ -76,7 +76,8 @@ def success_rows(
             runs = [found.get((task, preset, phase)) for phase in phases]
             shown = ["phase1", *["phase2"] * (len(phases) - 1)]
             values = [success(some, name) for some, name in zip(runs, shown, strict=True)]
-            seeds = str(max((len(some) for some in runs if some), default=""))
+            counts = [len(some) for some in runs if some]
+            seeds = " / ".join(map(str, counts if len(set(counts)) > 1 else counts[:1]))
             rows.append({"task": "", "by": f"`{preset}`", "seeds": seeds})
             rows[-1] |= dict(zip(heads, values, strict=True))
     return rows

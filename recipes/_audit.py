@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-from _shared import CLASSIFIER, REWARD, load_demonstrations, load_network
+from _shared import CLASSIFIER, REWARD, load_network, practised_pool
 from _worlds import open_world
 from omegaconf import DictConfig
 from torch import nn
@@ -32,7 +32,7 @@ def audit_callback(
     place, shown = world.played(episodes, **scenes)
     waiting, _ = world.played(episodes, waits=True, **scenes)
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
-    pool = load_demonstrations(run).pool()
+    pool = practised_pool(run, options)
 
     def audit(step: int) -> dict[str, float]:
         result = success_rate(policy, place, mode="both", **shown)

@@ -15,7 +15,7 @@ from torchrl.data import ReplayBuffer
 
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory
-from ifo_grounding.data import Demonstrations, LabelReport
+from ifo_grounding.data import Demonstrations, LabelReport, recombined
 from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.training.supervised import Validation
@@ -81,6 +81,12 @@ def starting_policy(run: Run, options: DictConfig, section: str) -> Any:
 def load_demonstrations(run: Run) -> Demonstrations:
     """Load the recorded demonstrations."""
     return Demonstrations.load(run.need(DEMONSTRATIONS, "record_demonstrations"))
+
+
+def practised_pool(run: Run, options: DictConfig) -> torch.Tensor:
+    """Return the instructions that may be chosen: those of the demonstrations, or more."""
+    pool = load_demonstrations(run).pool()
+    return torch.cat([pool, recombined(pool)]) if options.self_examine.recombine else pool
 
 
 def load_labels(run: Run) -> LabelReport:

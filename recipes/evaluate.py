@@ -10,9 +10,9 @@ from _shared import (
     GOAL,
     POLICIES,
     REWARD,
-    load_demonstrations,
     load_network,
     open_stage,
+    practised_pool,
 )
 from _worlds import Grid, World, open_world
 from omegaconf import DictConfig
@@ -36,6 +36,10 @@ from ifo_grounding.transforms import LearnedReward
 
 NAMES = dict(zip(("phase1", "phase2", "continued", "cloned"), (*POLICIES, *CONTROLS), strict=True))
 """Policies that a run may have, by their names in the results."""
+STAGES = dict(
+    zip(NAMES, ("imitate", "self_examine", "continue_imitation", "clone_accepted"), strict=True)
+)
+"""The stage that makes each; one whose phase 1 was made anew since belongs to another policy."""
 HELD_OUT = 500
 """Demonstrations, none of them trained on, that the action reward is compared with."""
 
@@ -53,13 +57,13 @@ def evaluate(options: DictConfig) -> dict:
     policies = {
         name: load_network(run, file, "imitate", options)
         for name, file in NAMES.items()
-        if (run / file).exists()
+        if (run / file).exists() and run.is_current(STAGES[name])
     }
     world = open_world(options)
     results |= evaluate_policies(policies, run, world)
     if world.oracle:
         results |= evaluate_endings(policies, world)
-        if options.evaluate.states and (run / CLASSIFIER).exists():
+        if options.evaluate.states and run.is_current("train_instruction"):
             results["suitability"] = evaluate_choices(run, world)
     results |= evaluate_judges(policies["phase1"], run, world)
     return stage.finish(results)
@@ -122,7 +126,7 @@ def evaluate_choices(run: Run, world: Grid) -> dict[str, Any]:
     result = suitable_rate(
         load_network(run, CLASSIFIER, "train_instruction", options),
         world.task,
-        load_demonstrations(run).pool(),
+        practised_pool(run, options),
         states=options.evaluate.states,
         threshold=section.threshold,
         candidates=section.candidates,
@@ -138,7 +142,7 @@ def evaluate_judges(policy: Any, run: Run, world: World) -> dict[str, Any]:
     options = world.options
     audited = evaluation_scenes(options)
     place, shown = world.played(options.evaluate.audit_episodes, waits=True, **audited)
-    if (run / REWARD).exists():
+    if run.is_current("train_reward"):
         judge = load_network(run, REWARD, "train_reward", options)
         if world.oracle:
             others = {name: value for name, value in audited.items() if name != "seed"}
@@ -146,7 +150,7 @@ def evaluate_judges(policy: Any, run: Run, world: World) -> dict[str, Any]:
             results["action_reward"] = reward_audit(judge, demos, truth).as_dict()
         audit = return_correlation(policy, judge, place, average=True, **shown)
         results["action_return"] = audit.as_dict()
-    if (run / GOAL).exists():
+    if run.is_current("train_goal"):
         judge = load_network(run, GOAL, "train_goal", options)
         reward = LearnedReward(judge, "goal", stop_action=world.stop)
         results["goal_return"] = return_correlation(policy, reward, place, **shown).as_dict()

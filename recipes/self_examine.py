@@ -13,6 +13,7 @@ from _shared import (
     load_labels,
     load_network,
     open_stage,
+    practised_pool,
     self_examination_config,
     shows_progress,
 )
@@ -23,7 +24,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import networks
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.data import labelled_buffer, recombined
+from ifo_grounding.data import labelled_buffer
 from ifo_grounding.objectives import ImitationLoss, RewardLoss
 from ifo_grounding.training import Adversary, Guard, Rehearsal, select_pairs, self_examine
 from ifo_grounding.training.run import Run
@@ -108,9 +109,7 @@ def learned_reward(run: Run, options: DictConfig) -> tuple[LearnedReward, Advers
 def chosen_starts(run: Run, options: DictConfig) -> InstructionSampler | StartingPairs:
     """Return fresh states with chosen instructions, or the paper's fixed number of pairs."""
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
-    pool = load_demonstrations(run).pool()
-    if options.self_examine.recombine:
-        pool = torch.cat([pool, recombined(pool)])
+    pool = practised_pool(run, options)
     section = options.instruction
     chosen = {name: section[name] for name in ("threshold", "candidates", "choose")}
     if options.self_examine.pairs is None:

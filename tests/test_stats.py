@@ -102,8 +102,21 @@ def test_shared_scenes_widen_the_interval():
 
 
 def test_bootstrap_never_gives_an_empty_interval():
-    rate = two_level_bootstrap(np.ones((3, 100)))
-    assert rate.low == wilson(300, 300).low < 1.0
+    ones = np.ones((3, 100))
+    assert two_level_bootstrap(ones).low == wilson(100, 100).low < 1.0
+    assert two_level_bootstrap(ones, shared_scenes=False).low == wilson(300, 300).low
+
+
+@pytest.mark.parametrize("seeds", [2, 3, 5])
+def test_the_noise_of_few_seeds_passes_for_a_gain_no_more_often_than_it_says(seeds):
+    # Training moves each seed's success by five points, up as often as down.
+    rng = np.random.default_rng(seeds)
+    found = 0
+    for _ in range(300):
+        before = rng.random((seeds, 200)) < 0.8
+        after = rng.random((seeds, 200)) < 0.8 + rng.normal(0, 0.05, (seeds, 1))
+        found += paired_difference(before, after, resamples=10).p_value < 0.05
+    assert found <= 24  # 5% would be 15; a binomial with 0.05 exceeds 24 in 1 of 100
 
 
 @pytest.mark.parametrize("shared", [True, False])

@@ -320,3 +320,14 @@ def test_babyai_shows_its_room_and_says_its_mission():
     td = env.reset()
     assert td["pixels"].shape == (2, 3, 64, 64)
     assert all(text.startswith("go to the") for text in words.decode(td["instruction"]))
+
+
+def test_success_is_measured_in_the_stream_that_is_asked_for():
+    env = dials(4)
+    streams = ("training", "validation", "evaluation")
+    policy = make_policy(env, seed=0, features=8)
+    found = {name: success_rate(policy, env, episodes=8, seed=3, stream=name) for name in streams}
+    assert len({result.scenes for result in found.values()}) == 3
+    assert env.stream == "training"
+    with pytest.raises(UserError, match="stream"):
+        success_rate(policy, env, episodes=8, stream="test")

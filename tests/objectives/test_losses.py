@@ -1,6 +1,7 @@
 """Values worked out by hand, from networks that answer what they are told."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -307,6 +308,26 @@ def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
     torch.testing.assert_close(after, before - math.log(3))
     with pytest.raises(UserError, match="estimated"):
         InstructionLoss(classifier, pool, removal_rate=0.3).calibrate()
+
+
+def test_calibration_after_a_checkpoint_is_that_of_the_uninterrupted_run():
+    shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
+    build = partial(make_instruction_classifier, shapes, "film", seed=0, features=16)
+    whole = InstructionLoss(build(), pool, removal_rate="estimated")
+    whole.negatives.watch(torch.ones(1000), torch.cat([torch.ones(250), -torch.ones(750)]))
+    resumed = InstructionLoss(build(), pool, removal_rate="estimated")
+    resumed.load_state_dict(whole.state_dict())
+    assert resumed.calibrate() == whole.calibrate()
+    inputs = {"pixels": torch.zeros(2, 3, 48, 48, dtype=torch.uint8), "instruction": pool[:2]}
+    torch.testing.assert_close(resumed.network(**inputs), whole.network(**inputs))
+
+
+def test_a_look_at_held_out_demonstrations_teaches_no_share():
+    loss = make_loss("instruction")
+    before = {name: value.clone() for name, value in loss.state_dict().items()}
+    loss.eval()(batch())
+    assert all(torch.equal(before[name], value) for name, value in loss.state_dict().items())
 
 
 def test_an_instruction_of_the_pool_suits_each_scene():

@@ -24,6 +24,18 @@ def test_a_stage_is_to_be_done_again_when_an_earlier_one_changed(tmp_path):
     assert run.stage("label", "x", needs=["record"]).result is None
 
 
+def test_what_was_made_from_an_earlier_stage_that_changed_is_not_current(tmp_path):
+    run = Run(tmp_path / "run")
+    assert not run.is_current("imitate")
+    run.stage("imitate", 1).finish({})
+    run.stage("practise", "x", needs=["imitate", "never"]).finish({})
+    run.stage("report", "y", needs=["practise"]).finish({})
+    assert run.is_current("practise") and run.is_current("report")
+    run.stage("imitate", 2).finish({})
+    assert run.is_current("imitate")
+    assert not run.is_current("practise") and not run.is_current("report")
+
+
 def test_what_is_missing_is_named_with_the_recipe_that_makes_it(tmp_path):
     with pytest.raises(UserError, match=r"inverse\.safetensors is missing: run the recipe train_"):
         Run(tmp_path / "run").need("inverse.safetensors", "train_inverse")

@@ -167,6 +167,9 @@ def test_the_adversary_calls_the_policys_actions_wrong():
     policy, value = make_networks()
     env = make_env(model)
     history = self_examine(env, policy, value, config(iterations=3), seed=0, adversary=adversary)
+    with pytest.raises(UserError, match="set select_every=0"):
+        looking = config(iterations=3, select_every=1)
+        self_examine(env, policy, value, looking, seed=0, adversary=adversary)
     first, last = history[0], history[-1]
     assert last["reward/loss_reward"] < first["reward/loss_reward"]
     assert last["reward/positive_probability"] > last["reward/negative_probability"]
@@ -237,9 +240,12 @@ def test_the_summary_counts_by_hand():
     batch["next", "done"][0, 3] = True
     batch["next", "terminated"][0, 3] = True
     batch["next", "done"][1, 3] = True
+    batch["next", "done"][2, 1] = True
+    batch["next", "terminated"][2, 1] = True
     batch["next", "learned_reward"].fill_(0.25)
-    said = summary(batch)
+    said = summary(batch)  # of 16 rows: ends after 4, 4 and 2 steps, 14 rows are cut
     assert said["frames"] == 64
-    assert said["episode_length"] == 32
-    assert said["learned_return"] == 8.0
-    assert said["stopped"] == 0.5
+    assert said["episode_length"] == pytest.approx(10 / 3)
+    assert said["learned_return"] == pytest.approx(2.5 / 3)
+    assert said["stopped"] == pytest.approx(2 / 3)
+    assert said["unfinished"] == pytest.approx(14 / 17)

@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_ty
 from ifo_grounding import keys, modules
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.seeding import derive
+from ifo_grounding.seeding import STREAMS, derive
 
 MAX_STEPS = 40
 MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
@@ -36,7 +36,8 @@ class Outcomes(NamedTuple):
     lengths: Tensor
     """Actions taken, the stop included, int64 [N]."""
     stopped: Tensor
-    """Whether the policy stopped by itself, bool [N]."""
+    """Whether the episode terminated, before the limit of its length: in a world that ends by
+    itself, not only by the policy's stop. Bool [N]."""
 
 
 def device_of(module: object) -> torch.device:
@@ -180,7 +181,14 @@ def scene_batches(
         if not isinstance(env, GymnasiumEnv):
             yield from _batches_of(env, len(numbers), seed, stream)
             return
+        check_choice("stream", stream, STREAMS)
+        kept, env.stream = env.stream, stream
         env.set_seed(seed)
+        try:
+            yield from _numbered(env, rows, torch.as_tensor(numbers, device=device))
+        finally:
+            env.stream = kept
+        return
     yield from _numbered(env, rows, torch.as_tensor(numbers, device=device))
 
 

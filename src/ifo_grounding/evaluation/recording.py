@@ -41,7 +41,7 @@ class Episode:
     success: bool
     """Whether it was fulfilled at the end."""
     stopped: bool
-    """Whether the policy stopped by itself."""
+    """Whether it terminated, before the limit of its length."""
     scene: int
     """Number of the scene in its stream."""
 

@@ -32,7 +32,8 @@ class SuccessResult:
     rate: Rate
     """Share of scenes whose instruction was fulfilled at the end, with Wilson's interval."""
     stopped: Rate
-    """Share of episodes that the policy ended by itself; the others ran out of steps."""
+    """Share of episodes that terminated, by the policy's stop or, in a world that ends by itself,
+    by the world; the others ran out of steps."""
     outcomes: Tensor
     """Success of each scene, bool [N], on the CPU."""
     lengths: Tensor

@@ -99,7 +99,8 @@ class GoalLoss(SupervisedLoss):
         with self._mode():
             own, other = pair_scores(self.network, batch[final], others[final])
             early, _ = pair_scores(self.network, batch[~final], others[~final, :0])
-        self.negatives.watch(own, other)
+        if self.training:
+            self.negatives.watch(own, other)
         kept = self.negatives.keep(other)
         finished = mean_or_zero(F.softplus(-own))
         unfinished = mean_or_zero(F.softplus(early))

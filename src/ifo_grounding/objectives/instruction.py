@@ -126,6 +126,7 @@ class InstructionLoss(SupervisedLoss):
         estimate = self.negatives.estimate
         if estimate is None:
             raise UserError("calibrate needs removal_rate='estimated'")
+        self.negatives.heed()  # what a checkpoint brought back
         least = 1 / len(self.negatives.pool)
         share = min(max(estimate.share(), least), MOST_REMOVED)
         mixed = self.unlabelled == "removal" and not self.negatives.share
@@ -143,7 +144,8 @@ class InstructionLoss(SupervisedLoss):
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
             own, other = pair_scores(self.network, batch, others)
-        self.negatives.watch(own, other)
+        if self.training:
+            self.negatives.watch(own, other)
         if self.unlabelled == "removal":
             kept = self.negatives.keep(other)
             refused = masked_mean(F.softplus(other), kept)

@@ -115,6 +115,11 @@ class NegativeInstructions(nn.Module):
         """Learn the share of suitable ones from scores of positives [N] and negatives [*, K]."""
         if self.estimate is not None:
             self.estimate.add(own, other[..., : self.uniform(other.shape[-1])])
+            self.heed()
+
+    def heed(self) -> None:
+        """Remove the share that is estimated by now, where it is estimated."""
+        if self.estimate is not None:
             share = min(self.estimate.share(), MOST_REMOVED)
             self.removal_rate = share if share >= LEAST_REMOVED else 0.0
 

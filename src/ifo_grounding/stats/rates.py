@@ -83,8 +83,9 @@ def two_level_bootstrap(
     """Return the mean success over training seeds, with an interval that counts their spread.
 
     Each replicate draws seeds with replacement, then scenes. The interval is a percentile interval,
-    widened to hold Wilson's of the pooled outcomes (so that it is never empty). With fewer than
-    about five seeds it is too narrow, as every bootstrap is.
+    widened to hold Wilson's of the pooled outcomes, so that it is never empty; where all outcomes
+    are the same, Wilson's of the different scenes. With few seeds it is too narrow, as every
+    bootstrap is: it knows of no spread but theirs.
 
     Args:
         outcomes: successes, bool [seeds, scenes]; [scenes] is one seed.
@@ -102,14 +103,16 @@ def two_level_bootstrap(
     rng = np.random.default_rng(seed)
     means = _resampled_means(values, resamples, shared_scenes, rng)
     tail = (1 - confidence) / 2
-    pooled = wilson(int(values.sum()), values.size, confidence)
+    same = shared_scenes and values.min() == values.max()
+    different = values.shape[1] if same else values.size
+    least = wilson(round(different * float(values.mean())), different, confidence)
     low, high = np.quantile(means, (tail, 1 - tail))
     return Rate(
-        rate=pooled.rate,
-        low=min(float(low), pooled.low),
-        high=max(float(high), pooled.high),
-        successes=pooled.successes,
-        count=pooled.count,
+        rate=float(values.mean()),
+        low=min(float(low), least.low),
+        high=max(float(high), least.high),
+        successes=int(values.sum()),
+        count=values.size,
         method=f"bootstrap over {len(values)} seeds and their scenes",
     )
 
@@ -124,9 +127,11 @@ def paired_difference(
 ) -> Difference:
     """Compare two policies on the same scenes.
 
-    With one seed ([scenes]) the p-value is McNemar's exact test; with several ([seeds, scenes]) it
-    and the interval come from the two-level bootstrap. Where no scene changed at all, the interval
-    is the exact one for a share of changes of which none was seen.
+    The interval comes from the two-level bootstrap. Where no scene changed at all, it is the exact
+    one for a share of changes of which none was seen. With one seed ([scenes]) the p-value is
+    McNemar's exact test, and speaks of this pair of policies; with several ([seeds, scenes]) it is
+    a t test over seeds, whose variance also counts the scenes that they share. Two seeds hardly
+    ever pass it, however narrow the interval.
 
     Args:
         before: successes of the first policy, bool [scenes] or [seeds, scenes].
@@ -164,9 +169,8 @@ def paired_difference(
             p_value = float(scipy_stats.binomtest(better, better + worse).pvalue)
         method = "bootstrap over scenes, exact McNemar test"
     else:
-        below, above = int((means <= 0).sum()), int((means >= 0).sum())
-        p_value = min(1.0, 2 * (1 + min(below, above)) / (1 + resamples))
-        method = f"bootstrap over {len(change)} seeds and their scenes"
+        p_value = _t_test(change)
+        method = f"bootstrap over {len(change)} seeds and their scenes, t test over seeds"
     return Difference(
         points=100 * float(change.mean()),
         low=100 * low,
@@ -177,6 +181,17 @@ def paired_difference(
         p_value=p_value,
         method=method,
     )
+
+
+def _t_test(change: NDArray[np.float64]) -> float:
+    """Return the p-value of no mean change in [seeds, scenes], for other seeds and other scenes."""
+    seeds, scenes = change.shape
+    of_seeds = change.mean(1).var(ddof=1) / seeds
+    of_scenes = change.mean(0).var() / scenes
+    error = math.sqrt(of_seeds + of_scenes)
+    if not error:
+        return 0.0 if change.any() else 1.0
+    return float(2 * scipy_stats.t.sf(abs(change.mean()) / error, seeds - 1))
 
 
 def holm(p_values: Sequence[float] | ArrayLike) -> list[float]:

@@ -69,15 +69,22 @@ def transforms_of(env: EnvBase) -> list[nn.Module]:
 
 
 def summary(batch: TensorDictBase) -> Metrics:
-    """Describe collected steps [N, T] by what the learner can see."""
-    done = batch[keys.NEXT, "done"]
-    stopped = batch[keys.NEXT, "terminated"]
-    reward = batch[keys.NEXT, keys.LEARNED_REWARD]
+    """Describe collected steps [N, T], which begin with a reset, by what the learner can see.
+
+    Returns and lengths are those of finished episodes: the last one of a row is mostly cut, and so
+    are all that take longer than T steps.
+    """
+    done = batch[keys.NEXT, "done"].reshape(batch.shape)
+    stopped = batch[keys.NEXT, "terminated"].reshape(batch.shape)
+    reward = batch[keys.NEXT, keys.LEARNED_REWARD].reshape(batch.shape)
+    finished = done.flip(-1).cumsum(-1).flip(-1) > 0
     episodes = done.sum().clamp(min=1)
+    cut = (~done[..., -1]).sum()
     return {
         "frames": float(batch.numel()),
         "learned_reward": float(reward.mean()),
-        "learned_return": float(reward.sum() / episodes),
-        "episode_length": float(batch.numel() / episodes),
+        "learned_return": float((reward * finished).sum() / episodes),
+        "episode_length": float(finished.sum() / episodes),
         "stopped": float(stopped.sum() / episodes),
+        "unfinished": float(cut / (done.sum() + cut)),
     }

@@ -1,4 +1,4 @@
-"""Noticing a reward that leads astray, by demonstrations that nothing has learned from."""
+"""Noticing a reward that leads astray, by demonstrations that the policy has not learned from."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ from ifo_grounding.modules import evaluating
 
 class Guard:
     """Asks whether a policy still does what demonstrations do that it never learned from.
+
+    Its weights may have been chosen by them, where imitation stopped by their likelihood, and the
+    judges learn from all demonstrations: what it reports is a warning, no estimate of success.
 
     A learned reward may take the policy's own mistakes for success. Practice then makes them more
     frequent while the learned return rises, and no look at that return can tell. Held-out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +88,16 @@ class Run:
     def stage(self, name: str, settings: Any, needs: Sequence[str] = ()) -> Stage:
         """Return a stage, done only if its settings and all that it needs are as they were."""
         earlier = {need: self.record(need).get("settings") for need in needs}
-        return Stage(self, name, fingerprint(settings, earlier))
+        return Stage(self, name, fingerprint(settings, earlier), earlier)
+
+    def is_current(self, name: str) -> bool:
+        """Return whether a stage is done, and none that it read from was done anew since."""
+        record = self.record(name)
+        return bool(record) and all(
+            self.record(need).get("settings") == settings
+            and (settings is None or self.is_current(need))
+            for need, settings in record.get("needs", {}).items()
+        )
 
     def record(self, name: str) -> dict[str, Any]:
         """Return what a stage left when it was done, empty where it was not."""
@@ -108,8 +117,10 @@ class Stage:
         checkpoint: file for its checkpoint.
     """
 
-    def __init__(self, run: Run, name: str, settings: str) -> None:
-        self.run, self.name, self.settings = run, name, settings
+    def __init__(
+        self, run: Run, name: str, settings: str, needs: Mapping[str, str | None] | None = None
+    ) -> None:
+        self.run, self.name, self.settings, self.needs = run, name, settings, dict(needs or {})
         record = run.record(name)
         self.result: dict[str, Any] | None = None
         if record.get("settings") == settings:
@@ -130,7 +141,8 @@ class Stage:
         seconds = round(time.monotonic() - self._start, 1)
         if history is not None:
             write_json(self.run.folder / "metrics" / f"{self.name}.json", list(history))
-        record = {"settings": self.settings, "result": result, "seconds": seconds}
+        made_of = {"settings": self.settings, "needs": self.needs}
+        record = {**made_of, "result": result, "seconds": seconds}
         write_json(self.run._record_path(self.name), record)
         for path in self.checkpoints():
             path.unlink(missing_ok=True)

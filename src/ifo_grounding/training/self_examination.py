@@ -145,9 +145,16 @@ def self_examine(
         Metrics of each iteration.
 
     Raises:
-        UserError: where the env exposes its true state, or has no learned reward.
+        UserError: where the env exposes its true state, or has no learned reward, or where the best
+            policy is to be selected by the returns of a judge that changes.
     """
     check_env(env)
+    if adversary and config.select_every:
+        raise UserError(
+            "an adversary trains the judge on, whose returns cannot then be compared from one look "
+            "to the next: set select_every=0 (self_examine.select_every), or practise without it "
+            "(self_examine.reward_steps=0)"
+        )
     policy.eval()
     value.eval()
     learner = _Learner(env, policy, value, config, rehearsal)
