@@ -34,6 +34,24 @@ def test_gates_differ_from_one_sentence_to_another_to_begin_with():
     assert gates.std(0).mean() > 0.1
 
 
+def test_a_rate_changes_what_a_sentence_part_learns_not_what_it_computes():
+    tokens = grammar("move").tokens.flatten(0, -2)
+    steps, outputs = [], []
+    for rate in (1.0, 0.1):
+        torch.manual_seed(0)
+        encoder = GRUInstructionEncoder(len(VOCABULARY), embedding=8, hidden=64, rate=rate)
+        gate = GatedAttention(encoder.size, 32, rate)
+        optimizer = torch.optim.Adam([*encoder.parameters(), *gate.parameters()], lr=1e-4)
+        before = gate(torch.ones(1, 32, 1, 1), encoder(tokens))
+        before[0].sum().backward()
+        optimizer.step()
+        after = gate(torch.ones(1, 32, 1, 1), encoder(tokens))
+        outputs.append(before)
+        steps.append(float((before - after).abs().mean()))
+    torch.testing.assert_close(*outputs)
+    assert steps[1] / steps[0] == pytest.approx(0.1, rel=0.2)
+
+
 def test_film_block_by_hand():
     block = ResidualFiLM(1, 1, kernel=3)
     with torch.no_grad():

@@ -61,6 +61,10 @@ class NetworkConfig:
     precision: str | None = None
     """``"fp32"``, ``"bf16"``, or ``"auto"``: bf16 where the hardware computes in it. None leaves it
     to the caller: float32, unless inside ``torch.autocast``."""
+    sentence_rate: float = 1.0
+    """How fast the sentence's encoder and the gates learn, by the rest (``paper``: 0.1). Their
+    weights are kept divided by it, so that an optimiser such as Adam, whose steps do not depend on
+    the scale of a gradient, takes smaller ones (an equalised rate, Karras et al. 2018)."""
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, PRESETS)
@@ -72,6 +76,10 @@ class NetworkConfig:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.patch_size is not None and self.patch_size < 1:
             raise UserError(f"patch_size must be at least 1, got {self.patch_size}")
+        if not 0 < self.sentence_rate <= 1:
+            raise UserError(f"sentence_rate must lie in (0, 1], got {self.sentence_rate}")
+        if self.sentence_rate != 1 and self.preset != "paper":
+            raise UserError("sentence_rate is of the GRU and the gates of preset 'paper' alone")
         if not 0 <= self.dropout < 1:
             raise UserError(f"dropout must lie in [0, 1), got {self.dropout}")
         object.__setattr__(self, "head_hidden", tuple(self.head_hidden))
@@ -108,6 +116,7 @@ _PAPER: dict[str, Any] = {
     "hidden": 64,
     "dropout": 0.25,
     "head_hidden": (128, 64),
+    "sentence_rate": 0.1,
 }
 _FILM: dict[str, Any] = {
     "features": 64,

@@ -244,13 +244,22 @@ class GRUInstructionEncoder(InstructionEncoder):
     It begins with orthogonal recurrences (Saxe et al. 2014) and large weights of words:
     PyTorch's own, which are smaller, would make all sentences nearly the same to begin with.
 
+    Args:
+        vocabulary_size: number of token ids.
+        embedding: size of a word's embedding.
+        hidden: size of the state, each way.
+        rate: how fast it learns, by the rest of a network: weights are kept divided by it.
+
     >>> encoder = GRUInstructionEncoder(vocabulary_size=40, embedding=8, hidden=64)
     >>> encoder(torch.randint(40, (5, 16))).shape
     torch.Size([5, 128])
     """
 
-    def __init__(self, vocabulary_size: int, embedding: int, hidden: int) -> None:
+    def __init__(
+        self, vocabulary_size: int, embedding: int, hidden: int, rate: float = 1.0
+    ) -> None:
         super().__init__(vocabulary_size, embedding, hidden)
+        self.rate = rate
         self.input_weight = nn.Parameter(torch.empty(2, embedding, 3 * hidden))
         self.input_bias = nn.Parameter(torch.zeros(2, 1, 3 * hidden))
         self.state_weight = nn.Parameter(torch.empty(2, hidden, 3 * hidden))
@@ -259,26 +268,28 @@ class GRUInstructionEncoder(InstructionEncoder):
         for way in self.state_weight.detach():
             for part in way.chunk(3, -1):
                 nn.init.orthogonal_(part)
+        for weight in self.parameters():
+            weight.detach().div_(rate)
 
     def _encode(self, tokens: Tensor) -> Tensor:
         """Run the GRU both ways over rows of ids [N, L], of which trailing zeros do not count."""
         lengths = sentence_lengths(tokens)
         step = torch.arange(tokens.shape[1], device=tokens.device)
         backward = tokens.gather(1, (lengths.unsqueeze(1) - 1 - step).clamp_min(0))
-        table = torch.baddbmm(
-            self.input_bias, self.embedding.weight.expand(2, -1, -1), self.input_weight
-        )
+        words = (self.rate * self.embedding.weight).expand(2, -1, -1)
+        table = torch.baddbmm(self.rate * self.input_bias, words, self.rate * self.input_weight)
+        recurrence = self.rate * self.state_weight, self.rate * self.state_bias
         gates = torch.stack([F.embedding(tokens, table[0]), F.embedding(backward, table[1])])
         alive = (step < lengths.unsqueeze(1)).unsqueeze(-1)
         state = gates.new_zeros(2, len(tokens), self.hidden)
         for index in range(tokens.shape[1]):
-            fresh = self._cell(gates[:, :, index], state)
+            fresh = self._cell(gates[:, :, index], state, *recurrence)
             state = torch.where(alive[:, index], fresh, state)
         return torch.cat([state[0], state[1]], -1)
 
-    def _cell(self, given: Tensor, state: Tensor) -> Tensor:
+    def _cell(self, given: Tensor, state: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """One step of a GRU, as ``nn.GRUCell`` defines it; ``given`` is W x + b for r, z, n."""
-        recalled = torch.baddbmm(self.state_bias, state, self.state_weight)
+        recalled = torch.baddbmm(bias, state, weight)
         gated = 2 * self.hidden
         reset, keep = torch.sigmoid(given[..., :gated] + recalled[..., :gated]).chunk(2, -1)
         candidate = torch.tanh(given[..., gated:] + reset * recalled[..., gated:])

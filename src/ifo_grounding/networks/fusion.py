@@ -21,20 +21,29 @@ class GatedAttention(nn.Module):
     (Chaplot et al. 2018). Weights of h begin so large that gates differ from one sentence to
     another: with PyTorch's own they differ by a hundredth, and learn from it late.
 
+    Args:
+        instruction_size: D, the size of an encoded instruction.
+        features: F, the channels of the feature map.
+        rate: how fast h learns, by the rest of the network: its weights are kept divided by it.
+            What is learned first, such as colours, drives gates that learn as fast as all else to
+            where a sigmoid hardly learns any more, and sentences that differ in what is to be
+            learned later, such as shapes, share their gates by then.
+
     >>> gate = GatedAttention(instruction_size=128, features=32)
     >>> gate(torch.ones(2, 32, 3, 3), torch.zeros(2, 128)).shape
     torch.Size([2, 32, 3, 3])
     """
 
-    def __init__(self, instruction_size: int, features: int) -> None:
+    def __init__(self, instruction_size: int, features: int, rate: float = 1.0) -> None:
         super().__init__()
+        self.rate = rate
         self.h = nn.Linear(instruction_size, features)
-        nn.init.normal_(self.h.weight, std=GATE_GAIN / math.sqrt(instruction_size))
+        nn.init.normal_(self.h.weight, std=GATE_GAIN / math.sqrt(instruction_size) / rate)
         nn.init.zeros_(self.h.bias)
 
     def forward(self, image: Tensor, instruction: Tensor) -> Tensor:
         """Gate ``image`` [N, F, H, W], i.e. CNN(s), by ``instruction`` [N, D], i.e. GRU(t)."""
-        return image * torch.sigmoid(self.h(instruction))[..., None, None]
+        return image * torch.sigmoid(self.rate * self.h(instruction))[..., None, None]
 
 
 class ResidualFiLM(nn.Module):

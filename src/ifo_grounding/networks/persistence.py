@@ -90,7 +90,8 @@ def load(
         shapes = Shapes(
             **{**content["shapes"], "image_shape": tuple(content["shapes"]["image_shape"])}
         )
-        module = MAKERS[found](shapes, device=device, seed=0, **options, **content["config"])
+        config = {"sentence_rate": 1.0, **content["config"]}  # files made before it have none
+        module = MAKERS[found](shapes, device=device, seed=0, **options, **config)
         module.load_state_dict(weights)
     except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]

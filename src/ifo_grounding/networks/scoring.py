@@ -179,7 +179,7 @@ class SentenceScorer(PairScorer):
         self.alone = cells_are_alone(config)
         size = self.instruction.size
         if self.paper:
-            self.fusion = nn.ModuleList([GatedAttention(size, features)])
+            self.fusion = nn.ModuleList([GatedAttention(size, features, config.sentence_rate)])
             size = features * math.prod(grid(shapes, config))
         else:
             self.fusion = nn.ModuleList(

@@ -166,8 +166,10 @@ def head(size: int, config: NetworkConfig, outputs: int) -> nn.Sequential:
 
 def instruction_encoder(shapes: Shapes, config: NetworkConfig) -> InstructionEncoder:
     """Return the configured encoder of instructions."""
-    kind = ConvInstructionEncoder if config.words == "conv" else GRUInstructionEncoder
-    return kind(shapes.vocabulary_size, config.embedding, config.hidden)
+    sizes = shapes.vocabulary_size, config.embedding, config.hidden
+    if config.words == "conv":
+        return ConvInstructionEncoder(*sizes)
+    return GRUInstructionEncoder(*sizes, config.sentence_rate)
 
 
 class Trunk(nn.Module):
@@ -182,7 +184,7 @@ class Trunk(nn.Module):
         self.readout: SpatialReadout | None = None
         self.alone = cells_are_alone(config)
         if config.preset == "paper":
-            self.fusion = nn.ModuleList([GatedAttention(size, features)])
+            self.fusion = nn.ModuleList([GatedAttention(size, features, config.sentence_rate)])
             self.size = features * math.prod(grid(shapes, config))
         else:
             self.fusion = nn.ModuleList(
