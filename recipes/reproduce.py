@@ -3,6 +3,7 @@
 python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 """
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -14,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from _shared import plain, result_file
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 from tqdm import tqdm
 
@@ -32,6 +35,8 @@ WANTED = {
     ("figure", 6): PHASES[:2],
 }
 """Pieces that each table and figure of the paper is made from; the first has phase 1."""
+RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
+"""Options that decide no result."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,27 @@ class Piece:
         """Whether its file is there and was made by the same call."""
         command = " ".join(["ifo-grounding", "run", "study", *self.arguments])
         return self.file.exists() and read_json(self.file)["command"] == command
+
+    def changed(self) -> list[str]:
+        """Return what today's presets and budgets say otherwise than the options of its file.
+
+        They are not part of its command, and a file that was made before they changed still counts
+        as done: its numbers are those of the options that it holds.
+        """
+        conf = str(Path(__file__).with_name("conf"))
+        begun = GlobalHydra.instance().is_initialized()  # as by the recipe itself
+        with (
+            contextlib.nullcontext()
+            if begun
+            else initialize_config_dir(version_base=None, config_dir=conf)
+        ):
+            today = flat(compose("study", overrides=list(self.arguments)))
+        then = flat(read_json(self.file)["options"])
+        return [
+            f"{name}={then.get(name, 'unknown')} (now {today.get(name, 'unknown')})"
+            for name in sorted(then.keys() | today.keys())
+            if then.get(name, "unknown") != today.get(name, "unknown") and name not in RUNNING
+        ]
 
     def make(self) -> int:
         """Make it in a process of its own, at one thread; what it prints goes to a file."""
@@ -206,6 +232,8 @@ def reproduce(options: DictConfig) -> list[Piece]:
     if options.list:
         for piece in (piece for chain in chains for piece in chain):
             print("done   " if piece.done else "not run", piece.file)
+            if piece.done and (changed := piece.changed()):
+                print("        made with", ", ".join(changed))
         return []
     failed: list[Piece] = []
     with (

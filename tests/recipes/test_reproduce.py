@@ -2,7 +2,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.files import read_json
+from ifo_grounding.files import read_json, write_json
 
 TINY = {
     "all.budget": "tiny",
@@ -30,7 +30,7 @@ def options(recipes, tmp_path, monkeypatch):
     return composed
 
 
-def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, tmp_path):
+def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     from reproduce import pieces, reproduce
 
     asked = options("figure=6", "tasks=[move]", "presets=[strong]")
@@ -43,6 +43,15 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, tmp_path):
     assert before["suitability"]["served"]["count"] == 50 and "suitability" not in after
     assert sum(after["endings"]["phase2"]["counts"].values()) == 50
     assert {"gained", "lost", "other path", "same path"} == set(after["changes"])
+
+    assert second.changed() == []
+    stored = read_json(second.file)
+    stored["options"]["instruction"]["candidates"] += 1
+    write_json(second.file, stored)
+    assert reproduce(options("figure=6", "tasks=[move]", "presets=[strong]", "list=true")) == []
+    *_, listed, noted = capsys.readouterr().out.splitlines()
+    assert listed == f"done    {second.file}"
+    assert noted.strip().startswith("made with instruction.candidates=")
 
     written = second.file.stat().st_mtime_ns
     assert reproduce(asked) == []
