@@ -14,7 +14,7 @@ from torchrl import torchrl_logger
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding import networks
-from ifo_grounding.allocation import keep_freed_memory
+from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
 from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
@@ -46,6 +46,7 @@ def open_run(options: DictConfig) -> Run:
 
 def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:
     """Return a stage that is decided by some sections of the options, the seed and the world."""
+    release_freed_memory()  # of the stage before
     common = ["task", "seed", "network", "world"]
     decisive = {key: plain(options[key]) for key in [*common, *sections]}
     stage = open_run(options).stage(name, decisive, needs)

@@ -14,6 +14,7 @@ from torchrl.data import TensorDictReplayBuffer
 from tqdm import tqdm
 
 from ifo_grounding import keys
+from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.data.buffers import FINAL, frame_buffer
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import fact, load_folder, save_folder
@@ -22,6 +23,8 @@ from ifo_grounding.modules import device_of, evaluating
 
 KIND = "ifo-grounding labels"
 VERSION = 1
+RELEASE_EVERY = 16
+"""Batches after which freed memory is given back: theirs differ in size and would pile up."""
 QUANTILES = {"min": 0.0, "p01": 0.01, "p10": 0.1, "median": 0.5}
 
 
@@ -134,13 +137,15 @@ def label_demonstrations(
     frame = demos.locate()[1]
     labels, sure, n_actions = [], [], 0
     with evaluating(inverse), tqdm(total=len(frame), desc="label", disable=not progress) as bar:
-        for numbers in frame.split(batch_size):
+        for count, numbers in enumerate(frame.split(batch_size), 1):
             logits = _logits(demos, inverse, numbers, device, logits_key)
             n_actions = logits.shape[-1]
             best = logits.float().softmax(-1).max(-1)
             labels.append(best.indices.to("cpu", torch.uint8 if n_actions <= 256 else torch.int32))
             sure.append(best.values.cpu())
             bar.update(len(numbers))
+            if not count % RELEASE_EVERY:
+                release_freed_memory()
     report = LabelReport(torch.cat(labels), torch.cat(sure), n_actions)
     return Labelled(labelled_buffer(demos, report.actions, **buffer_options), report)
 
