@@ -41,6 +41,8 @@ NAMES = {
 }
 
 PHASES = ("phase1", "phase2")
+NAMED = ("task", "demonstrations", "preset")
+JUDGED = ("suitable", "served", "servable")
 
 BABYAI_POLICIES = {
     "bot": "demonstrator",
@@ -90,16 +92,22 @@ def study_section() -> list[str]:
         " with 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired"
         " by scene. Where demonstrations were held out, their likelihood stopped phase 1"
         " ([too early](#variants-of-phase-1), as it turned out)."
-        " `continued` and `cloned` are the [controls](phase2.md#controls). The columns"
-        " before the last hold, for each seed, the share of suitable instructions among those"
-        " chosen, of states served, and of states that any instruction of the pool suits, by the"
-        " oracle: the most that could be served. p is that of no gain, by a"
-        " [t test over seeds](evaluation.md#intervals), of one seed by McNemar's, corrected (Holm)"
-        " for the tasks with as many demonstrations.",
+        " `continued` and `cloned` are the [controls](phase2.md#controls). p is that of no gain, by"
+        " a [t test over seeds](evaluation.md#intervals), of one seed by McNemar's, corrected"
+        " (Holm) for the tasks with as many demonstrations.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
-        markdown_table(rows),
+        markdown_table([shown(row, *JUDGED) for row in rows]),
+        "Of each seed the share of suitable instructions among those chosen, of states served, and"
+        " of states that any instruction of the pool suits, by the oracle: the most that could be"
+        " served.",
+        markdown_table([{name: row[name] for name in (*NAMED, *JUDGED)} for row in rows]),
         commands_note(practised().values()),
     ]
+
+
+def shown(row: dict[str, Any], *without: str) -> dict[str, Any]:
+    """Return a row without some of its columns."""
+    return {name: value for name, value in row.items() if name not in without}
 
 
 @functools.cache
@@ -303,10 +311,9 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
     row = {
         "task": task,
         "demonstrations": f"{n:,}",
-        "preset": kind,
+        "preset": f"{kind}, {held_out:.0%} held out" if held_out else kind,
         "seeds": len(runs),
         "scenes": f"{both[0].shape[1]:,}{stream}",
-        "held out": f"{held_out:.0%}",
         "phase 1": brief(two_level_bootstrap(both[0])),
         "phase 2": brief(two_level_bootstrap(both[1])),
         "gain, points": brief(paired_difference(*both)),
@@ -335,7 +342,7 @@ def adjusted(found: dict[Key, list[dict[str, Any]]]) -> list[str]:
             for key in members
         ]
         corrected |= dict(zip(members, holm([test.p_value for test in tests]), strict=True))
-    return [f"{corrected[key]:.2g}" for key in found]
+    return [f"{p:.2g}" if (p := corrected[key]) >= 1e-4 else "< 0.0001" for key in found]
 
 
 def efficient() -> dict[str, dict[int, dict[str, Rate]]]:
@@ -420,6 +427,7 @@ def hacking_picture() -> Figure | None:
 def page(found: list[dict[str, Any]]) -> str:
     """Return the page of results."""
     parts = [
+        "---\nhide: [toc]\n---",  # its tables are wide
         "# Results",
         "Every number here comes from a file under `results/`, which holds all options, the seed,"
         " the commit and the machine. `python docs/make_results.py` writes this page from them.",
@@ -441,10 +449,8 @@ def page(found: list[dict[str, Any]]) -> str:
 
 def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
-    shown = ("task", "demonstrations", "seeds", "phase 1", "phase 2", "gain, points")
-    against = ("over continued", "over cloned")
-    strong = [row for row in study_rows() if row["preset"] == "strong"]
-    rows = [{name: row[name] for name in (*shown, *against)} for row in strong]
+    aside = ("preset", "scenes", "p", *JUDGED)
+    rows = [shown(row, *aside) for row in study_rows() if row["preset"] == "strong"]
     text = renewed(text, "results", f"\n{markdown_table(rows)}\n")
     return renewed(text, "babyai", strong_levels())
 

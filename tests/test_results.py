@@ -164,6 +164,6 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
         "| pick | `strong` | 15 | 0 | 0 | 5 | 0 | 0 |",
         "| phase 2 alone | pick | `strong` | 2 | 0 | 0 | 0 |",
         "| pick | `strong` | 1 | 3 |",
-        "13.0% [10.3, 16.2]",
+        "13.0% [10.3,\u00a016.2]",
     ):
         assert shown in text

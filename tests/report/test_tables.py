@@ -33,7 +33,7 @@ def test_markdown_table():
         [
             "| task | success |",
             "| --- | ---: |",
-            "| move | 97.3% [96.5, 97.9] (n=2000) |",
+            "| move | 97.3% [96.5,\u00a097.9] (n=2000) |",
             r"| pick\|out | – |",
         ]
     )
@@ -51,3 +51,9 @@ def test_cells(value, text):
 def test_empty_tables_are_refused(make):
     with pytest.raises(UserError, match="at least one row"):
         make([])
+
+
+def test_intervals_are_not_broken_by_a_browser():
+    row = {"success": wilson(5, 10), "speed": "1M [0.9M, 1.1M]", "words": "[one, two, three]"}
+    line = markdown_table([row]).splitlines()[-1]
+    assert line == "| 50.0% [23.7,\u00a076.3] (n=10) | 1M [0.9M,\u00a01.1M] | [one, two, three] |"

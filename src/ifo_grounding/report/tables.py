@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ Row = Mapping[str, Any]
 """One row of a table: what each column says."""
 
 MISSING = "–"
+INTERVAL = re.compile(r"\[([^\s,\]]+), ([^\s,\]]+)\]")
 
 
 def format_cell(value: Any) -> str:
@@ -90,6 +92,8 @@ def text_table(
 def markdown_table(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
     """Return a table in markdown; arguments as :func:`text_table`.
 
+    Browsers do not break lines within an interval: there its space is a non-breaking one.
+
     >>> print(markdown_table([{"task": "move", "share": 0.5}]))
     | task | share |
     | --- | ---: |
@@ -99,8 +103,13 @@ def markdown_table(rows: Sequence[Row], columns: Sequence[str] | None = None) ->
         raise UserError("a table needs at least one row")
     names = columns_of(rows, columns)
     rule = ["---:" if _aligned_right(rows, name) else "---" for name in names]
-    escaped = [[text.replace("|", r"\|") for text in row] for row in _cells(rows, names)]
+    escaped = [[_escaped(text) for text in row] for row in _cells(rows, names)]
     return "\n".join(f"| {' | '.join(row)} |" for row in [names, rule, *escaped])
+
+
+def _escaped(text: str) -> str:
+    """Return a cell as markdown takes it."""
+    return INTERVAL.sub("[\\1,\u00a0\\2]", text.replace("|", r"\|"))
 
 
 def renewed(text: str, mark: str, part: str) -> str:
