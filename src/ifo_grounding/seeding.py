@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Sequence
 
 import torch
+from torch import Tensor
 
 STREAMS = ("training", "validation", "evaluation")
 """Disjoint streams of scenes (choices are made on validation, results on evaluation)."""
@@ -26,3 +28,26 @@ def generator(
 ) -> torch.Generator:
     """Return a generator on ``device`` seeded with :func:`derive`."""
     return torch.Generator(device=device or "cpu").manual_seed(derive(seed, *names))
+
+
+Generators = torch.Generator | Sequence[torch.Generator] | None
+"""Where random rows come from: one generator (None is the global one), or several in equal shares,
+each of which draws what it would draw alone."""
+
+
+def draw_rows(
+    draw: Callable[[int, torch.Generator | None], Tensor], n: int, source: Generators
+) -> Tensor:
+    """Return ``draw(n, generator)``, or of several generators what each draws, one after another.
+
+    >>> pair = [generator(0, "left"), generator(0, "right")]
+    >>> rows = draw_rows(lambda n, g: torch.rand(n, 2, generator=g), 6, pair)
+    >>> bool((rows[3:] == torch.rand(3, 2, generator=generator(0, "right"))).all())
+    True
+    """
+    if source is None or isinstance(source, torch.Generator):
+        return draw(n, source)
+    share, rest = divmod(n, len(source))
+    if rest:
+        raise ValueError(f"{n} rows are no equal shares of {len(source)} generators")
+    return torch.cat([draw(share, each) for each in source])

@@ -55,6 +55,16 @@ def test_a_number_names_one_scene_in_any_order():
     assert not same(scenes[0], scenes[2])
 
 
+@pytest.mark.parametrize(
+    "options", [{"task": "pick"}, {"instructed": False}, {"split": "zero-shot"}]
+)
+def test_chunks_that_are_drawn_side_by_side_are_those_drawn_alone(monkeypatch, options):
+    together = first(3 * CHUNK, **options)
+    monkeypatch.setattr(module, "AHEAD", 1)
+    monkeypatch.setattr(module, "BLOCK", CHUNK)
+    assert same(together, first(3 * CHUNK, **options))
+
+
 def test_the_same_seed_gives_the_same_scenes_and_another_seed_others():
     assert same(first(100, task="pick"), first(100, task="pick"))
     assert not looks(first(1000, task="pick")) & looks(first(1000, seed=1, task="pick"))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import Generators, draw_rows
 from ifo_grounding.world.state import N_BOXES, N_KINDS, WorldState
 
 
@@ -51,7 +52,7 @@ def random_layout(
     batch: int,
     layout: Layout | None = None,
     *,
-    generator: torch.Generator | None = None,
+    generator: Generators = None,
     device: torch.device | str | None = None,
 ) -> WorldState:
     """Draw initial states: objects and boxes in distinct places, the arm anywhere, nothing held.
@@ -67,7 +68,11 @@ def random_layout(
     most_objects, most_boxes = layout.objects[1], layout.boxes[1]
 
     def rand(*shape: int) -> Tensor:
-        return torch.rand(batch, *shape, generator=generator, device=device)
+        return draw_rows(
+            lambda rows, source: torch.rand(rows, *shape, generator=source, device=device),
+            batch,
+            generator,
+        )
 
     def count(low: int, high: int) -> Tensor:
         return low + (rand(1) * (high - low + 1)).long()
