@@ -77,7 +77,7 @@ def test_practice_for_a_judge_that_leads_astray_is_given_up(guarded, tmp_path):
     before = {name: weight.clone() for name, weight in policy.state_dict().items()}
     guard = Guard(policy, held_out(2)) if guarded else None
     misled = config(
-        iterations=4, lr=3e-2, value_warmup=0, select_every=2, select_episodes=32, max_steps=5
+        iterations=4, gamma=0.0, lr=3e-3, entropy=0.0, epochs=3, select_every=2, max_steps=5
     )
     file = tmp_path / "checkpoint.pt"
     history = self_examine(
@@ -87,6 +87,6 @@ def test_practice_for_a_judge_that_leads_astray_is_given_up(guarded, tmp_path):
     same = all(torch.equal(weight, before[name]) for name, weight in policy.state_dict().items())
     assert looks[-1]["selection_return"] > 2
     assert same == guarded
-    assert looks[-1]["selected"] == (not guarded)
+    assert looks[0]["selected"] == (not guarded)
     if guarded:
         assert looks[-1]["held_out_agreement"] < 0.5
