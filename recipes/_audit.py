@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-from _shared import CLASSIFIER, REWARD, load_network, practised_pool
+from _shared import CLASSIFIER, load_network, practised_pool
 from _worlds import open_world
 from omegaconf import DictConfig
 from torch import nn
 
+from ifo_grounding.data import Demonstrations, Truth
 from ifo_grounding.evaluation import (
     return_correlation,
     reward_audit,
@@ -51,7 +52,7 @@ def audit_callback(
             **(actions() if world.oracle else {}),
         }
 
-    # The instruction module and the saved judge do not change while the policy practises.
+    # The instruction module does not change while the policy practises.
     @functools.cache
     def instructions() -> dict[str, float]:
         chosen = suitable_rate(
@@ -66,11 +67,13 @@ def audit_callback(
         return {"suitable": chosen.rate.rate}
 
     @functools.cache
+    def shown_by_expert() -> tuple[Demonstrations, Truth]:
+        return world.demonstrate(EXPERT_EPISODES, **scenes)
+
     def actions() -> dict[str, float]:
         if options.self_examine.kind == "goal":
             return {}
-        demos, truth = world.demonstrate(EXPERT_EPISODES, **scenes)
-        judge = load_network(run, REWARD, "train_reward", options)
-        return {"action_auc": reward_audit(judge, demos, truth).auc.value}
+        assert reward.action_judge is not None  # as it is by now: it may be trained on
+        return {"action_auc": reward_audit(reward.action_judge, *shown_by_expert()).auc.value}
 
     return audit

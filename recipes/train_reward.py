@@ -1,7 +1,14 @@
 """Train the reward module: which actions are right (paper, 2nd-phase)."""
 
-from _shared import REWARD, load_demonstrations, load_labels, open_stage, train
-from _worlds import build
+from _shared import (
+    REWARD,
+    load_demonstrations,
+    load_labels,
+    open_stage,
+    starting_policy,
+    train,
+)
+from _worlds import build, context_of
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
@@ -11,11 +18,14 @@ from ifo_grounding.objectives import RewardLoss
 
 
 def train_reward(options: DictConfig) -> dict:
-    stage = open_stage(options, "train_reward", ["reward"], needs=["label"])
+    needs = ["label", *(["imitate"] if options.reward.init_from_policy else [])]
+    stage = open_stage(options, "train_reward", ["reward"], needs)
     if stage.result is not None:
         return stage.result
     buffer = labelled_buffer(load_demonstrations(stage.run), load_labels(stage.run).actions)
-    loss = RewardLoss(build(make_reward_model, options))
+    policy = starting_policy(stage.run, options, "reward")
+    context = context_of(options, "imitate") if policy is not None else 0
+    loss = RewardLoss(build(make_reward_model, options, init_from=policy, context=context))
     return train(options, stage, loss, buffer, "reward", REWARD)
 
 

@@ -15,6 +15,7 @@ from ifo_grounding.networks import (
     make_instruction_classifier,
     make_inverse,
     make_policy,
+    make_reward_model,
     make_value,
 )
 from ifo_grounding.networks.transfer import trunk_of
@@ -101,6 +102,16 @@ def test_a_critic_starts_from_the_policys_trunk_and_goes_its_own_way(pair):
     with torch.no_grad():
         next(target.parameters()).add_(1)
     assert not torch.equal(next(source.parameters()), next(target.parameters()))
+
+
+@pytest.mark.parametrize("preset", ["film", "paper"])
+def test_a_judge_of_actions_may_start_from_the_policys_trunk_too(shapes, preset):
+    policy = make_policy(shapes, preset, seed=0)
+    judge = make_reward_model(shapes, preset, init_from=policy, seed=1)
+    source, target = trunk_of(policy), judge.module.trunk
+    assert all(map(torch.equal, source.parameters(), target.parameters()))
+    with pytest.raises(UserError, match="trunk of init_from does not fit"):
+        make_reward_model(shapes, preset, init_from=policy, embedding=5)
 
 
 def test_a_trunk_that_does_not_fit_is_refused(shapes):

@@ -8,12 +8,13 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
 from ifo_grounding import keys
 from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.transfer import copy_weights, trunk_of
 from ifo_grounding.networks.trunk import InstructedNetwork, same_batch
 
 
@@ -40,6 +41,7 @@ def make_reward_model(
     *,
     in_keys: Sequence[NestedKey] = (keys.PIXELS, keys.INSTRUCTION, keys.ACTION),
     out_key: NestedKey = keys.ACTION_SCORE,
+    init_from: nn.Module | None = None,
     device: torch.device | str | None = None,
     seed: int | None = None,
     **overrides: Any,
@@ -54,12 +56,16 @@ def make_reward_model(
         in_keys: the image, uint8 [*B, C, H, W], the instruction, int64 [*B, L], and the action,
             integer [*B].
         out_key: where the logit goes.
+        init_from: a policy of the same preset, ``"film"`` or ``"paper"``, and the same sizes, whose
+            trunk's weights are copied. Practice leads a policy to what its judge likes best, so
+            that the judge has to know as much (an extension of the paper).
         device: where to build it.
         seed: makes the initial weights a function of the seed alone.
         overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
 
     Raises:
-        UserError: for an unknown preset or option, or sizes that cannot be read.
+        UserError: for an unknown preset or option, sizes that cannot be read, or a policy that
+            does not fit.
 
     >>> rwd = make_reward_model(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), torch.ones(2, 16)
@@ -69,4 +75,7 @@ def make_reward_model(
     check_keys(in_keys, ("image", "instruction", "action"))
     options = {"in_keys": list(in_keys), "out_key": out_key}
     plan = blueprint("reward", spec_source, preset, options, overrides)
-    return wrap(construct(RewardNetwork, plan, device, seed), plan, in_keys, [out_key])
+    network = construct(RewardNetwork, plan, device, seed)
+    if init_from is not None:
+        copy_weights([(trunk_of(init_from), network.trunk)], init_from, plan)
+    return wrap(network, plan, in_keys, [out_key])
