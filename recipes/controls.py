@@ -15,14 +15,14 @@ from _shared import (
 )
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig, OmegaConf
-from self_examine import needs, practice
+from self_examine import guard_of, judge_learns, needs, practice
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.training import FitConfig, Guard, Rehearsal, Selection, Stage, accepted_steps
+from ifo_grounding.training import FitConfig, Rehearsal, Selection, Stage, accepted_steps
 
 SECTIONS = ["imitate", "self_examine", "instruction", "controls"]
 
@@ -63,8 +63,8 @@ def imitate_on(
 ) -> dict[str, Any]:
     """Train the phase-1 policy on, with as many gradient samples as phase 2, and save it.
 
-    The weights to keep are chosen as phase 2 chooses its own: by the learned return of the greedy
-    policy, as often, on the same starts.
+    The weights to keep are chosen as phase 2 chooses its own: by the same measure of the greedy
+    policy, as often, on the same episodes.
     """
     section = options.self_examine
     policy = load_network(stage.run, POLICIES[0], "imitate", options)
@@ -75,8 +75,11 @@ def imitate_on(
     if section.select_every:
         # Before any rollout, so that it remembers the first starts.
         chosen = self_examination_config(section)
-        guard = Guard(policy, aside) if aside is not None else None
-        selection = Selection(env, policy, chosen.selection, options.seed, guard)
+        guard = guard_of(policy, aside, stage.run, options)
+        by_agreement = judge_learns(options)
+        selection = Selection(
+            env, policy, chosen.selection, options.seed, guard, by_agreement=by_agreement
+        )
         selection.look()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)
         iteration = options.imitate.get("iteration", FitConfig.iteration)

@@ -20,6 +20,8 @@ from _shared import (
 from _worlds import build, context_of, open_world
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import networks
@@ -52,7 +54,7 @@ def examine(options: DictConfig) -> dict:
         seed=options.seed,
         adversary=adversary,
         rehearsal=rehearsed,
-        guard=Guard(policy, aside) if aside is not None else None,
+        guard=guard_of(policy, aside, run, options),
         checkpoint=stage.checkpoint,
         log=stage.log(),
         callback=audit_callback(policy, reward, run, options),
@@ -61,6 +63,26 @@ def examine(options: DictConfig) -> dict:
     )
     networks.save(policy, run / POLICIES[1])
     return stage.finish(history[-1], history)
+
+
+def judge_learns(options: DictConfig) -> bool:
+    """Whether the judge of actions is trained on while the policy practises."""
+    return options.self_examine.kind != "goal" and options.self_examine.reward_steps > 0
+
+
+def guard_of(
+    policy: TensorDictModuleBase, aside: ReplayBuffer | None, run: Run, options: DictConfig
+) -> Guard | None:
+    """Return what asks demonstrations whether the policy goes astray.
+
+    They are those held out. Where none are, but agreement has to decide, since the judge learns on,
+    they are as many of those learned from as episodes would be looked at.
+    """
+    section = options.self_examine
+    if aside is None and section.select_every and judge_learns(options):
+        demos = load_demonstrations(run)[: section.select_episodes]
+        aside = labelled_buffer(demos, load_labels(run).actions[: demos.transitions])
+    return Guard(policy, aside) if aside is not None else None
 
 
 def needs(options: DictConfig) -> list[str]:
@@ -90,7 +112,7 @@ def learned_reward(run: Run, options: DictConfig) -> tuple[LearnedReward, Advers
         judges["action"] = load_network(run, REWARD, "train_reward", options)
     if section.kind != "action":
         judges["goal"] = load_network(run, GOAL, "train_goal", options)
-    if "action" in judges and section.reward_steps:
+    if judge_learns(options):
         demos = labelled_buffer(load_demonstrations(run), load_labels(run).actions)
         adversary = Adversary(
             RewardLoss(judges["action"]), demos, section.reward_steps, section.reward_lr

@@ -4,8 +4,17 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from ifo_grounding.data import Demonstrations, labelled_buffer
 from ifo_grounding.errors import UserError
-from ifo_grounding.training import Guard, self_examine
-from training.test_self_examination import config, likes, make_env, make_networks
+from ifo_grounding.networks import make_reward_model
+from ifo_grounding.objectives import RewardLoss
+from ifo_grounding.training import Adversary, Guard, Selection, SelectionSchedule, self_examine
+from training.test_self_examination import (
+    SMALL,
+    config,
+    likes,
+    make_env,
+    make_networks,
+    simulator,
+)
 
 LENGTHS = (3, 5, 2) * 20
 
@@ -64,6 +73,32 @@ def test_only_who_clearly_falls_behind_the_first_look_is_astray():
     assert again.look()[1]
 
 
+def test_beside_an_adversary_the_policy_that_agrees_most_is_kept():
+    """The judge's own returns would keep the last policy, which the judge has led astray."""
+    policy, value = make_networks()
+    torch.nn.init.constant_(policy[0].module.head[-1].bias[2], 1.0)
+    before = {name: weight.clone() for name, weight in policy.state_dict().items()}
+    misled = config(iterations=2, gamma=0.0, lr=3e-3, entropy=0.0, epochs=3, select_every=1)
+    guard = Guard(policy, held_out(2))
+    still = Adversary(RewardLoss(make_reward_model(simulator(1), **SMALL)), held_out(2), 1, 0.0)
+    history = self_examine(
+        make_env(likes(1)), policy, value, misled, seed=0, guard=guard, adversary=still
+    )
+    assert [metrics["selected"] for metrics in history] == [0, 0]
+    assert history[-1]["agreement"] < 0.5
+    assert "selection_return" not in history[-1]
+    assert all(torch.equal(weight, before[name]) for name, weight in policy.state_dict().items())
+    with pytest.raises(UserError, match="give a guard"):
+        self_examine(make_env(likes(1)), policy, value, misled, seed=0, adversary=still)
+
+
+def test_a_choice_by_agreement_needs_demonstrations():
+    policy, _ = make_networks()
+    schedule = SelectionSchedule(every=1, iterations=1, episodes=1, max_steps=1, margin=0.0)
+    with pytest.raises(UserError, match="needs a guard"):
+        Selection(make_env(), policy, schedule, seed=0, by_agreement=True)
+
+
 def test_nothing_held_out_is_refused():
     with pytest.raises(UserError, match="no held-out samples"):
         Guard(Sometimes(), TensorDictReplayBuffer(storage=LazyTensorStorage(4)))
@@ -89,4 +124,4 @@ def test_practice_for_a_judge_that_leads_astray_is_given_up(guarded, tmp_path):
     assert same == guarded
     assert looks[0]["selected"] == (not guarded)
     if guarded:
-        assert looks[-1]["held_out_agreement"] < 0.5
+        assert looks[-1]["agreement"] < 0.5

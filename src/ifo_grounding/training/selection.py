@@ -14,10 +14,14 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from ifo_grounding import keys
+from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.environment import reseed, sampler_stats, transforms_of
 from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.supervised import Metrics
+
+AGREEMENT = "agreement"
+"""Metric: share of the guard's demonstrations' actions that the greedy policy would take."""
 
 
 @torch.no_grad()
@@ -122,7 +126,9 @@ class SelectionSchedule:
 
 
 class Selection:
-    """Measures the learned return, always from the same starts, and keeps the best weights.
+    """Measures the policy, always on the same episodes, and keeps the best weights.
+
+    The measure is the learned return or, where the judge changes, agreement with demonstrations.
 
     Self-examination asks it from time to time; it also serves :func:`~ifo_grounding.training.fit`
     as ``held_out``, so that other training can stop by the same rule.
@@ -133,9 +139,12 @@ class Selection:
         schedule: when to look, and for how long.
         seed: of the starts.
         guard: refuses weights with which the policy goes astray, whatever their return.
-    """
+        by_agreement: choose by the agreement with the guard's demonstrations instead of the learned
+            return, which says nothing from one look to the next where the judge is trained on.
 
-    metric = "selection_return"
+    Raises:
+        UserError: where a choice by agreement has no guard.
+    """
 
     def __init__(
         self,
@@ -144,9 +153,13 @@ class Selection:
         schedule: SelectionSchedule,
         seed: int,
         guard: Guard | None = None,
+        by_agreement: bool = False,
     ) -> None:
+        if by_agreement and guard is None:
+            raise UserError("a choice by agreement needs a guard, which holds the demonstrations")
         self.env, self.policy, self.schedule, self.seed = env, policy, schedule, seed
-        self.guard = guard
+        self.guard, self.by_agreement = guard, by_agreement
+        self.metric = AGREEMENT if by_agreement else "selection_return"
         self.best = BestPolicy(policy, schedule.margin)
         self.fixed = [t for t in transforms_of(env) if getattr(t, "fixes_scenes", False)]
         self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
@@ -160,10 +173,24 @@ class Selection:
         return self._consider()
 
     def look(self) -> float:
-        """Return the mean learned return, and remember the weights if it is high enough."""
+        """Return the mean of what decides, and remember the weights if it is high enough."""
         return self._consider()[self.metric]
 
     def _consider(self) -> Metrics:
+        if self.by_agreement:
+            assert self.guard is not None
+            agreement = self.guard.agreement()
+            selected = self.best.consider(agreement)
+            return {AGREEMENT: float(agreement.mean()), "selected": float(selected)}
+        returns = self._returns()
+        found = {self.metric: float(returns.mean())}
+        astray = False
+        if self.guard:
+            found[AGREEMENT], astray = self.guard.look()
+        return {**found, "selected": float(not astray and self.best.consider(returns))}
+
+    def _returns(self) -> Tensor:
+        """Measure the learned returns, always from the same starts, and leave all else as it is."""
         schedule = self.schedule
         present = copy.deepcopy([starts.state_dict() for starts in self.fixed])
         for starts, first in zip(self.fixed, self.first_starts, strict=True):
@@ -177,11 +204,7 @@ class Selection:
         sampler_stats(self.env)
         for starts, state in zip(self.fixed, present, strict=True):
             starts.load_state_dict(state)
-        found = {self.metric: float(returns.mean())}
-        astray = False
-        if self.guard:
-            found["held_out_agreement"], astray = self.guard.look()
-        return {**found, "selected": float(not astray and self.best.consider(returns))}
+        return returns
 
     def restore(self) -> None:
         """Give the policy the best weights back."""

@@ -73,8 +73,9 @@ class SelfExaminationConfig:
     grad_clip: float = 1.0
     """Largest norm of the gradient."""
     select_every: int = 0
-    """Iterations between two looks at the greedy policy's learned return. In the end the best
-    policy is kept, which may be phase 1's; 0 keeps the last one."""
+    """Iterations between two looks at the greedy policy's learned return or, beside an adversary,
+    its agreement with the guard's demonstrations. In the end the best policy is kept, which may be
+    phase 1's; 0 keeps the last one."""
     select_margin: float = 2.0
     """Standard errors by which a policy has to be better than the best one to be kept: 2 keeps
     clear gains alone, -1 keeps all practice that does no clear harm."""
@@ -134,7 +135,8 @@ def self_examine(
             from a reset: a run continues from its checkpoint to the same result.
         adversary: trains the reward model on, with the steps of each iteration.
         rehearsal: imitates the demonstrations on.
-        guard: keeps policies from being selected that go astray of held-out demonstrations.
+        guard: keeps policies from being selected that go astray of its demonstrations. With an
+            adversary the best policy is the one that agrees most with them.
         checkpoint: file to continue from and to save to.
         log: gets the metrics of each iteration.
         callback: gets the iteration, returns further metrics; the place for audits.
@@ -146,20 +148,21 @@ def self_examine(
 
     Raises:
         UserError: where the env exposes its true state, or has no learned reward, or where the best
-            policy is to be selected by the returns of a judge that changes.
+            policy is to be selected beside an adversary, without a guard.
     """
     check_env(env)
-    if adversary and config.select_every:
+    by_agreement = adversary is not None and config.select_every > 0
+    if by_agreement and guard is None:
         raise UserError(
             "an adversary trains the judge on, whose returns cannot then be compared from one look "
-            "to the next: set select_every=0 (self_examine.select_every), or practise without it "
-            "(self_examine.reward_steps=0)"
+            "to the next: give a guard, by whose demonstrations the best policy is selected, or "
+            "set select_every=0 to keep the last"
         )
     policy.eval()
     value.eval()
     learner = _Learner(env, policy, value, config, rehearsal)
     sampler_stats(env)  # forgets the reset that a collector begins with
-    selection = Selection(env, policy, config.selection, seed, guard)
+    selection = Selection(env, policy, config.selection, seed, guard, by_agreement)
     parts: dict[str, Any] = {
         "loss": learner.loss,
         "optimizer": learner.optimizer,
