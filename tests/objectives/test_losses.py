@@ -178,6 +178,18 @@ def test_the_non_negative_risk_takes_the_share_of_positives_off_by_hand():
     assert early == pytest.approx((as_positive + as_negative) / 2, rel=1e-5)
 
 
+def test_a_mixture_drops_nothing_however_many_are_suitable():
+    pool = torch.tensor([[1, 0], [2, 0]])
+    data = TensorDict({"pixels": torch.zeros(2, 1), "instruction": pool}, [2])
+    network = suitability([0.9, 0.6])
+    loss = InstructionLoss(network, pool, removal_rate=0.5, unlabelled="mixture")
+    out = loss(data)
+    as_positive = -(math.log(0.9) + math.log(0.6)) / 2
+    as_negative = -(math.log(0.1) + math.log(0.4)) / 2
+    assert out["loss_instruction"].item() == pytest.approx((as_positive + as_negative) / 2)
+    assert float(out["removed"]) == 0
+
+
 def test_a_risk_below_zero_is_turned_round():
     own, other = torch.full((4,), 3.0), torch.full((4, 2), -3.0, requires_grad=True)
     loss = InstructionLoss(
@@ -308,6 +320,12 @@ def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
     torch.testing.assert_close(after, before - math.log(3))
     with pytest.raises(UserError, match="estimated"):
         InstructionLoss(classifier, pool, removal_rate=0.3).calibrate()
+    mixture = InstructionLoss(classifier, pool, unlabelled="mixture")
+    mixture.negatives.watch(torch.ones(1000), torch.cat([torch.ones(250), -torch.ones(750)]))
+    assert mixture.calibrate() == pytest.approx(0.25)
+    torch.testing.assert_close(
+        classifier(pixels=image, instruction=words).sigmoid(), 0.25 * before.exp()
+    )
 
 
 def test_calibration_after_a_checkpoint_is_that_of_the_uninterrupted_run():

@@ -22,7 +22,7 @@ from ifo_grounding.objectives.pairs import (
     pair_scores,
 )
 
-UNLABELLED = ("removal", "non-negative")
+UNLABELLED = ("removal", "non-negative", "mixture")
 
 
 class InstructionLoss(SupervisedLoss):
@@ -54,7 +54,8 @@ class InstructionLoss(SupervisedLoss):
         unlabelled: what is done about false negatives. ``"removal"`` drops the negatives scored
             highest; ``"non-negative"`` drops none, but takes the share's worth of the positives'
             loss off the negatives' loss, which is kept from falling below zero (nnPU, Kiryo et al.
-            2017, with both classes weighing the same).
+            2017, with both classes weighing the same). ``"mixture"`` drops none either:
+            :meth:`calibrate` then counts how many suitable ones they hold (Elkan and Noto 2008).
         near: share of the negatives that differ from the own instruction in few words.
         generator: where random numbers come from; None is the global generator.
 
@@ -129,7 +130,8 @@ class InstructionLoss(SupervisedLoss):
         self.negatives.heed()  # what a checkpoint brought back
         least = 1 / len(self.negatives.pool)
         share = min(max(estimate.share(), least), MOST_REMOVED)
-        mixed = self.unlabelled == "removal" and not self.negatives.share
+        kept = self.unlabelled == "removal" and not self.negatives.share
+        mixed = kept or self.unlabelled == "mixture"
         self.network.module.expect(share, mixed)
         return share
 
@@ -151,7 +153,8 @@ class InstructionLoss(SupervisedLoss):
             refused = masked_mean(F.softplus(other), kept)
         else:
             kept = torch.ones_like(other, dtype=torch.bool)
-            refused = self._non_negative(own, other)
+            mixture = self.unlabelled == "mixture"
+            refused = F.softplus(other).mean() if mixture else self._non_negative(own, other)
         loss = (F.softplus(-own).mean() + refused) / 2
         if self.contrast:
             logits = torch.cat([own.unsqueeze(1), other.masked_fill(~kept, -torch.inf)], 1)
