@@ -101,6 +101,11 @@ class Difference(_Described):
     +2.5 points [+1.0, +4.0] (60 better, 10 worse, n=2000)
     >>> print(Difference(0.1, 0.0, 0.2, better=15, worse=5, count=10000, p_value=0.06, method=""))
     +0.10 points [+0.00, +0.20] (15 better, 5 worse, n=10000)
+
+    A bound that one digit would round to zero gets two as well:
+
+    >>> print(Difference(0.2, 0.02, 0.3, better=10, worse=2, count=5000, p_value=0.04, method=""))
+    +0.20 points [+0.02, +0.30] (10 better, 2 worse, n=5000)
     """
 
     points: float
@@ -123,7 +128,8 @@ class Difference(_Described):
     def __str__(self) -> str:
         """Return the difference, its interval and how many scenes changed."""
         changed = f"{self.better} better, {self.worse} worse, n={self.count}"
-        digits = 1 if self.high - self.low >= 0.25 else 2
+        near_zero = any(0 < abs(bound) < 0.05 for bound in (self.low, self.high))
+        digits = 2 if near_zero or self.high - self.low < 0.25 else 1
         points, low, high = (f"{x:+.{digits}f}" for x in (self.points, self.low, self.high))
         return f"{points} points [{low}, {high}] ({changed})"
 
