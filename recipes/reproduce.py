@@ -46,6 +46,8 @@ class Piece:
     run: str
     arguments: tuple[str, ...]
     file: Path
+    base: str | None = None
+    """The run that it begins with."""
 
     @property
     def done(self) -> bool:
@@ -76,8 +78,6 @@ class Piece:
 
     def make(self) -> int:
         """Make it in a process of its own, at one thread; what it prints goes to a file."""
-        if self.done:
-            return 0
         self.log.parent.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, str(Path(__file__).with_name("study.py")), *self.arguments]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -89,7 +89,12 @@ class Piece:
     @property
     def log(self) -> Path:
         """Where its output goes."""
-        return home() / "runs" / f"{self.run}.log"
+        return self.folder.with_name(f"{self.run}.log")
+
+    @property
+    def folder(self) -> Path:
+        """Where its run lies."""
+        return home() / "runs" / self.run
 
 
 def pieces(options: DictConfig) -> list[list[Piece]]:
@@ -150,7 +155,8 @@ def ablated(options: DictConfig, task: str, name: str, seed: int) -> Piece:
     }
     parts = (task, given["demonstrations.n"], given["preset"], name, seed)
     file = result_file(options.ablations, *parts)
-    return Piece(runs[name], tuple(f"{key}={value}" for key, value in given.items()), file)
+    arguments = tuple(f"{key}={value}" for key, value in given.items())
+    return Piece(runs[name], arguments, file, given.get("base"))
 
 
 def level_chains(options: DictConfig) -> list[list[Piece]]:
@@ -214,7 +220,7 @@ def chain(
         }
         arguments = tuple(f"{name}={value}" for name, value in given.items())
         of = (task, options.demonstrations, preset, phase, seed)
-        yield Piece(names[phase], arguments, result_file(options.results, *of))
+        yield Piece(names[phase], arguments, result_file(options.results, *of), given.get("base"))
 
 
 def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any]:
@@ -224,6 +230,20 @@ def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any
         full = above + name
         found |= flat(value, f"{full}.") if isinstance(value, dict) else {full: value}
     return found
+
+
+def to_make(chain: list[Piece]) -> list[Piece]:
+    """Return what is missing of a chain: pieces that are not done, and runs that they begin with.
+
+    Files of results are kept with the code, runs are not: on another machine a piece may be done
+    whose run is not there.
+    """
+    bases = {piece.base for piece in chain if not (piece.done or piece.folder.exists())}
+    return [
+        piece
+        for piece in chain
+        if not piece.done or (piece.run in bases and not (piece.folder / "stages").is_dir())
+    ]
 
 
 def reproduce(options: DictConfig) -> list[Piece]:
@@ -236,8 +256,9 @@ def reproduce(options: DictConfig) -> list[Piece]:
                 print("        made with", ", ".join(changed))
         return []
     failed: list[Piece] = []
+    missing = [to_make(chain) for chain in chains]
     with (
-        tqdm(total=sum(map(len, chains)), unit="piece", disable=not options.progress) as bar,
+        tqdm(total=sum(map(len, missing)), unit="piece", disable=not options.progress) as bar,
         ThreadPoolExecutor(options.jobs) as pool,
     ):
 
@@ -249,7 +270,7 @@ def reproduce(options: DictConfig) -> list[Piece]:
                     return
                 bar.update()
 
-        list(pool.map(run, chains))
+        list(pool.map(run, missing))
     return failed
 
 

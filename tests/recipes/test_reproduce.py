@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 from hydra import compose, initialize_config_dir
 
@@ -56,6 +58,13 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     written = second.file.stat().st_mtime_ns
     assert reproduce(asked) == []
     assert second.file.stat().st_mtime_ns == written
+    # Where results came along and runs did not, what builds on phase 1 needs it again.
+    shutil.rmtree(first.folder)
+    assert reproduce(asked) == [] and not first.folder.exists()
+    shutil.rmtree(second.folder)
+    second.file.unlink()
+    assert reproduce(asked) == []
+    assert first.folder.exists() and read_json(second.file)["results"]["phase1"] == after["phase1"]
     # Other options, another piece.
     ((_, changed),) = pieces(
         options("figure=6", "tasks=[move]", "presets=[strong]", "options_of.all.threads=2")
