@@ -225,13 +225,26 @@ def ablation_row(
 def zero_shot_content() -> str:
     """Return the part of the page on zero-shot that the results decide."""
     found = pieces()
-    rows = []
+    rates, endings = [], []
     for task in TASKS:
         for preset in PRESETS:
-            for phase, piece in (("phase1", "zero-shot"), ("phase2", "zero-shot-pairs-5000")):
+            for phase, piece in (
+                ("phase1", "zero-shot"),
+                ("phase2", "zero-shot-pairs-5000"),
+                ("phase1", "zero-shot-unseen"),
+            ):
                 if runs := found.get((task, preset, piece)):
-                    rows.append(zero_shot_row(runs, phase))
-    return table(rows)
+                    common = zero_shot_common(runs, phase)
+                    rates.append({**common, **zero_shot_rates(runs, phase)})
+                    endings.append({**common, **zero_shot_endings(runs, phase)})
+    return "\n\n".join(
+        [
+            table(rates),
+            "Success of each held-out pair, and where the agent ended instead; of wrong objects,"
+            " how many share the colour, the shape or neither with the right one:",
+            table(endings),
+        ]
+    )
 
 
 def readme_tables() -> str:
@@ -271,32 +284,43 @@ def readme_zero_shot() -> str:
     return table(rows)
 
 
-def zero_shot_row(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
-    """Return success on held-out and on trained pairs, and where the agent went instead."""
+def zero_shot_common(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
+    """Return what was run: the first cells of both tables."""
     options = runs[0]["options"]
-    held_out = [run["results"]["endings"][phase] for run in runs]
+    return {
+        "task": options["task"],
+        "preset": f"`{options['network']}`",
+        "phase": phase[-1],
+        "lie about": "yes" if options["world"]["holdout_visible"] else "no",
+    }
+
+
+def zero_shot_rates(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
+    """Return success on held-out and on trained pairs."""
     trained = [run["results"]["trained"][phase]["counts"] for run in runs]
     of_trained = wilson(
         sum(counts["success"] for counts in trained),
         sum(sum(counts.values()) for counts in trained),
     )
-    row = {
-        "task": options["task"],
-        "preset": f"`{options['network']}`",
-        "phase": phase[-1],
+    return {
         "seeds": str(len(runs)),
         "held-out pairs": brief(two_level_bootstrap(outcomes(runs, phase))),
         "trained pairs": brief(of_trained),
     }
-    for name in HOLDOUTS[options["world"]["holdout"]]:
+
+
+def zero_shot_endings(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
+    """Return success of each held-out pair, and where the agent went instead."""
+    held_out = [run["results"]["endings"][phase] for run in runs]
+    row = {}
+    for name in HOLDOUTS[runs[0]["options"]["world"]["holdout"]]:
         each = [ends["by_object"][name] for ends in held_out if name in ends["by_object"]]
         row[name] = f"{100 * sum(won for won, _ in each) / sum(of for _, of in each):.1f}%"
     total = sum(sum(ends["counts"].values()) for ends in held_out)
-    shares = [100 * sum(ends["counts"][name] for ends in held_out) / total for name in FAILURES]
-    row[", ".join(FAILURES)] = ", ".join(f"{share:.1f}%" for share in shares)
-    alike = [f"{sum(ends['shared'][name] for ends in held_out)} {name}" for name in SHARED[1:]]
-    row["wrong objects share"] = ", ".join(alike)
-    return row
+    for name in FAILURES:
+        row[name] = f"{100 * sum(ends['counts'][name] for ends in held_out) / total:.1f}%"
+    alike = (str(sum(ends["shared"][name] for ends in held_out)) for name in SHARED[1:])
+    return {**row, ", ".join(SHARED[1:]): ", ".join(alike)}
 
 
 VARIANTS = {

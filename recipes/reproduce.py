@@ -27,10 +27,11 @@ from ifo_grounding.files import home, read_json
 
 PHASES = ("phase-1", "pairs-5000", "pairs-10000")
 ZERO_SHOT = ("zero-shot", "zero-shot-pairs-5000")
+UNSEEN = "zero-shot-unseen"
 WANTED = {
     ("table", 2): PHASES,
     ("table", 3): PHASES[:1],
-    ("table", 4): ZERO_SHOT,
+    ("table", 4): (*ZERO_SHOT, UNSEEN),
     ("figure", 5): PHASES[:1],
     ("figure", 6): PHASES[:2],
 }
@@ -194,7 +195,7 @@ def wanted_phases(options: DictConfig) -> list[str]:
     for kind, number in asked:
         check_choice(kind, number, [of for which, of in WANTED if which == kind])
     needed = {phase for key in asked for phase in WANTED[key]}
-    return [phase for phase in (*PHASES, *ZERO_SHOT) if phase in needed]
+    return [phase for phase in (*PHASES, *ZERO_SHOT, UNSEEN) if phase in needed]
 
 
 def chain(
@@ -203,7 +204,7 @@ def chain(
     """Yield the pieces of one task, preset and seed, each phase 1 before what builds on it."""
     sections = options.options_of
     for phase in phases:
-        first = ZERO_SHOT[0] if phase in ZERO_SHOT else PHASES[0]
+        first = next(of[0] for of in (PHASES, ZERO_SHOT, (UNSEEN,)) if phase in of)
         names = {part: f"tables-{task}-{preset}-{part}-seed{seed}" for part in (phase, first)}
         given = {
             "task": task,
