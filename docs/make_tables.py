@@ -331,6 +331,8 @@ VARIANTS = {
     "sentence-decay": "the same, weight decay of 1",
     "sentence-early": "the same, stopped after a quarter of the steps",
     "sentence-jitter": "the same, brightness of each colour channel drawn anew at every step",
+    "sentence-absent": "the same, objects of held-out pairs never lie about while it learns",
+    "whole-absent": "the preset, objects of held-out pairs never lie about while it learns",
     "cells-whole": "words see whole cells, not colour and form",
     "silent-whole": "what hears no words sees colours too",
     "no-charge": "speaking is free",

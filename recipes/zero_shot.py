@@ -1,6 +1,8 @@
 """Zero-shot, one part at a time: what the preset `strong` owes to each of its parts.
 
-And what common remedies do for `film`, which hears a sentence as one vector.
+And what common remedies do for `film`, which hears a sentence as one vector. With
+``world.holdout_visible=false`` objects of held-out pairs are absent from what is learned from, so
+that nothing says that they are never meant: variants of their own.
 
 python recipes/zero_shot.py task=move seed=0
 """
@@ -147,7 +149,7 @@ def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
         best = best_beginning(options, stage, seen, None, functools.partial(beginning, name))
         best.learn()
         results = stage.finish(measured(best.loss.network, options))
-    options.variant = name
+    options.variant = name if options.world.holdout_visible else f"{name}-absent"
     keep_result(options, write_result(options, results, "run zero_shot"))
     return results
 
