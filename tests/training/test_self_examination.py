@@ -16,6 +16,7 @@ from ifo_grounding.training import (
     Rehearsal,
     SelfExaminationConfig,
     select_pairs,
+    self_examination,
     self_examine,
 )
 from ifo_grounding.training.environment import summary
@@ -124,6 +125,18 @@ def test_divergence_from_phase_1_costs_reward():
         for kl in (0.0, 10.0)
     ]
     assert held < free - 0.1
+
+
+def test_values_of_some_worlds_at_a_time_are_those_of_all_at_once(monkeypatch):
+    learned = []
+    for steps in (8, 40, 10_000):  # one world, five, all sixteen
+        monkeypatch.setattr(self_examination, "AT_ONCE", steps)
+        nets = make_networks()
+        self_examine(make_env(), *nets, config(gamma=0.9), seed=0)
+        learned.append([p.detach() for net in nets for p in net.parameters()])
+    for some in learned[:2]:
+        for one, whole in zip(some, learned[2], strict=True):
+            torch.testing.assert_close(one, whole, atol=1e-4, rtol=1e-3)
 
 
 def test_a_killed_run_continues_to_the_same_weights(tmp_path):

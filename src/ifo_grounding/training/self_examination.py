@@ -17,6 +17,7 @@ from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
 from torchrl.objectives.value import GAE
 
 from ifo_grounding import keys
+from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.adversary import Adversary
@@ -36,6 +37,8 @@ from ifo_grounding.training.supervised import Callback, Log, Metrics, make_optim
 
 ALGORITHMS = ("ppo", "reinforce")
 NAME = "self-examination"
+AT_ONCE = 2048
+"""Steps whose values are estimated at once: as fast as all of them, in a fraction of the memory."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +200,7 @@ def self_examine(
             metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
             metrics |= sampler_stats(env)
             metrics |= learner.improve(batch, iteration)
+            release_freed_memory()  # batches of distinct pictures differ in size and would pile up
             if adversary:
                 metrics |= adversary(batch)
             done = iteration + 1
@@ -267,8 +271,7 @@ class _Learner:
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""
         config = self.config
-        with torch.no_grad():
-            self.advantage(batch)
+        self._judge(batch)
         scale = 1 - iteration / config.iterations if config.anneal else 1.0
         trained = iteration >= config.value_warmup
         self.optimizer.param_groups[0]["lr"] = scale * config.lr if trained else 0.0
@@ -287,6 +290,13 @@ class _Learner:
                     sums[key] = sums.get(key, torch.zeros(())) + scalar.cpu()
                 updates += 1
         return {key: float(total) / updates for key, total in sums.items()}
+
+    @torch.no_grad()
+    def _judge(self, batch: TensorDictBase) -> None:
+        """Write advantages and value targets of steps [N, T], some worlds at a time."""
+        known = list(batch.keys(True, True))
+        parts = batch.split(max(1, AT_ONCE // batch.shape[-1]))
+        batch.update(torch.cat([self.advantage(part).exclude(*known) for part in parts]))
 
     def close(self) -> None:
         """Let go of the collector, and leave the env open for its owner."""
