@@ -282,18 +282,18 @@ class GRUInstructionEncoder(InstructionEncoder):
         gates = torch.stack([F.embedding(tokens, table[0]), F.embedding(backward, table[1])])
         alive = (step < lengths.unsqueeze(1)).unsqueeze(-1)
         state = gates.new_zeros(2, len(tokens), self.hidden)
-        for index in range(tokens.shape[1]):
-            fresh = self._cell(gates[:, :, index], state, *recurrence)
-            state = torch.where(alive[:, index], fresh, state)
-        return torch.cat([state[0], state[1]], -1)
+        # Split once: each slice of its own would get a gradient as large as the whole.
+        for given, counts in zip(gates.unbind(2), alive.unbind(1), strict=True):
+            state = torch.where(counts, self._cell(given, state, *recurrence), state)
+        return torch.cat(state.unbind(), -1)
 
     def _cell(self, given: Tensor, state: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """One step of a GRU, as ``nn.GRUCell`` defines it; ``given`` is W x + b for r, z, n."""
-        recalled = torch.baddbmm(bias, state, weight)
-        gated = 2 * self.hidden
-        reset, keep = torch.sigmoid(given[..., :gated] + recalled[..., :gated]).chunk(2, -1)
-        candidate = torch.tanh(given[..., gated:] + reset * recalled[..., gated:])
-        return torch.lerp(candidate, state, keep)
+        parts = 2 * self.hidden, self.hidden
+        gates, heard = given.split(parts, -1)
+        opened, recalled = torch.baddbmm(bias, state, weight).split(parts, -1)
+        reset, keep = torch.sigmoid(gates + opened).chunk(2, -1)
+        return torch.lerp(torch.tanh(heard + reset * recalled), state, keep)
 
 
 def sentence_lengths(tokens: Tensor) -> Tensor:
