@@ -38,15 +38,12 @@ def test_variants_leave_a_file_each_and_are_made_once(options, tmp_path):
     assert read_json(file)["results"] == found["cells-whole"]
     assert sum(found["whole"]["held-out"]["counts"].values()) == 30
     trained = set(found["whole"]["trained"]["by_object"])
-    assert not trained & {"blue circle", "blue triangle", "red rectangle"}
+    held_out = {"blue circle", "blue triangle", "red rectangle"}
+    assert not trained & held_out
     assert compare(options("variants=[whole]"))["whole"] == found["whole"]
     compare(options("variants=[sentence]", "run=two", "world.holdout_visible=false"))
     absent = read_json(tmp_path / "move-60-strong-sentence-absent-seed0.json")
-    assert set(absent["results"]["held-out"]["by_object"]) <= {
-        "blue circle",
-        "blue triangle",
-        "red rectangle",
-    }
+    assert set(absent["results"]["held-out"]["by_object"]) <= held_out
     with pytest.raises(UserError, match="unknown variant 'hole'"):
         compare(options("variants=[hole]"))
 

@@ -271,7 +271,7 @@ class _Learner:
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""
         config = self.config
-        self._judge(batch)
+        self._estimate_advantages(batch)
         scale = 1 - iteration / config.iterations if config.anneal else 1.0
         trained = iteration >= config.value_warmup
         self.optimizer.param_groups[0]["lr"] = scale * config.lr if trained else 0.0
@@ -292,11 +292,11 @@ class _Learner:
         return {key: float(total) / updates for key, total in sums.items()}
 
     @torch.no_grad()
-    def _judge(self, batch: TensorDictBase) -> None:
+    def _estimate_advantages(self, batch: TensorDictBase) -> None:
         """Write advantages and value targets of steps [N, T], some worlds at a time."""
-        known = list(batch.keys(True, True))
         parts = batch.split(max(1, AT_ONCE // batch.shape[-1]))
-        batch.update(torch.cat([self.advantage(part).exclude(*known) for part in parts]))
+        found = self.advantage.out_keys
+        batch.update(torch.cat([self.advantage(part).select(*found) for part in parts]))
 
     def close(self) -> None:
         """Let go of the collector, and leave the env open for its owner."""
