@@ -9,8 +9,12 @@ from ifo_grounding.networks import (
     ConvInstructionEncoder,
     GRUInstructionEncoder,
     PatchEncoder,
+    encoders,
 )
+from ifo_grounding.networks.cells import look_up
+from ifo_grounding.networks.encoders import beginnings
 from ifo_grounding.networks.patches import distinct_blocks, distinct_windows
+from ifo_grounding.tasks import TASKS, VOCABULARY, grammar
 
 
 def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) -> torch.Tensor:
@@ -76,10 +80,10 @@ def test_ids_outside_the_vocabulary_are_refused(encoder, bad):
 
 def test_each_distinct_instruction_is_encoded_once(encoder, monkeypatch):
     rows = []
-    encode = type(encoder)._encode
+    encode = type(encoder)._encode_distinct
     monkeypatch.setattr(
         type(encoder),
-        "_encode",
+        "_encode_distinct",
         lambda self, tokens: rows.append(len(tokens)) or encode(self, tokens),
     )
     pool = sentences(12)
@@ -102,6 +106,45 @@ def test_gradients_are_those_of_encoding_every_row_and_repeat_exactly(encoder):
     for grad, every in zip(once, gradients(encoder._encode), strict=True):
         torch.testing.assert_close(grad, every, rtol=1e-4, atol=1e-5)
     assert all(map(torch.equal, once, gradients(encoder)))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(task, monkeypatch):
+    monkeypatch.setattr(encoders, "ENOUGH_TO_SHARE", 0)
+    torch.manual_seed(0)
+    encoder = GRUInstructionEncoder(len(VOCABULARY), embedding=8, hidden=16, rate=0.1).double()
+    known = grammar(task).tokens
+    tokens = torch.cat([known[torch.randint(len(known), (300,))], known[:1] * 0])
+    target = torch.randn(len(tokens), 32, dtype=torch.float64)
+
+    def encoded(encode):
+        encoder.zero_grad()
+        features = encode(tokens)
+        (features * target).sum().backward()
+        return [features.detach(), *(parameter.grad.clone() for parameter in encoder.parameters())]
+
+    once = encoded(lambda tokens: look_up(*encoder.distinct(tokens)))
+    for part, every in zip(once, encoded(encoder._encode), strict=True):
+        torch.testing.assert_close(part, every)
+
+
+def test_ids_of_padding_between_words_are_words_of_their_own(monkeypatch):
+    monkeypatch.setattr(encoders, "ENOUGH_TO_SHARE", 0)
+    torch.manual_seed(0)
+    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16)
+    rows = torch.cartesian_prod(*[torch.arange(3)] * 5)  # any of five may be padding
+    torch.testing.assert_close(encoder._encode_distinct(rows), encoder._encode(rows))
+
+
+def test_beginnings_are_fewer_than_words():
+    tokens = grammar("pick-out").tokens
+    lengths = (tokens != 0).sum(1)
+    steps, ends = beginnings(tokens, lengths)
+    assert len(ends.unique()) == len(tokens)
+    for length, (words, _) in enumerate(steps, start=1):
+        longer = tokens[lengths >= length, :length]
+        assert len(words) == len(longer.unique(dim=0))
+    assert sum(len(words) for words, _ in steps) < int(lengths.sum()) / 4
 
 
 def test_encoder_works_under_vmap(encoder):

@@ -189,10 +189,14 @@ class InstructionEncoder(nn.Module):
         if not distinct.numel():
             return self.embedding.weight.new_zeros(len(distinct), self.size), inverse
         distinct = without_padding(distinct, self.embedding.num_embeddings)
-        return self._encode(distinct), inverse
+        return self._encode_distinct(distinct), inverse
 
     def _encode(self, tokens: Tensor) -> Tensor:
         raise NotImplementedError
+
+    def _encode_distinct(self, tokens: Tensor) -> Tensor:
+        """Encode different instructions, none of them longer than the table of ids is wide."""
+        return self._encode(tokens)
 
 
 class ConvInstructionEncoder(InstructionEncoder):
@@ -230,6 +234,8 @@ def over_words(layer: nn.Conv1d, words: Tensor) -> Tensor:
 
 WORD_GAIN = 2.0
 """Standard deviation of what a GRU hears of a word to begin with, by that of its embedding."""
+ENOUGH_TO_SHARE = 128
+"""Sentences from which on it pays to look for what they begin with alike."""
 
 
 class GRUInstructionEncoder(InstructionEncoder):
@@ -275,25 +281,87 @@ class GRUInstructionEncoder(InstructionEncoder):
         """Run the GRU both ways over rows of ids [N, L], of which trailing zeros do not count."""
         lengths = sentence_lengths(tokens)
         step = torch.arange(tokens.shape[1], device=tokens.device)
-        backward = tokens.gather(1, (lengths.unsqueeze(1) - 1 - step).clamp_min(0))
-        words = (self.rate * self.embedding.weight).expand(2, -1, -1)
-        table = torch.baddbmm(self.rate * self.input_bias, words, self.rate * self.input_weight)
-        recurrence = self.rate * self.state_weight, self.rate * self.state_bias
-        gates = torch.stack([F.embedding(tokens, table[0]), F.embedding(backward, table[1])])
+        table, weight, bias = self._scaled()
+        ways = zip(both_ways(tokens, lengths), table, strict=True)
+        gates = torch.stack([F.embedding(words, known) for words, known in ways])
         alive = (step < lengths.unsqueeze(1)).unsqueeze(-1)
         state = gates.new_zeros(2, len(tokens), self.hidden)
         # Split once: each slice of its own would get a gradient as large as the whole.
         for given, counts in zip(gates.unbind(2), alive.unbind(1), strict=True):
-            state = torch.where(counts, self._cell(given, state, *recurrence), state)
+            recalled = torch.baddbmm(bias, state, weight)
+            state = torch.where(counts, self._cell(given, recalled, state), state)
         return torch.cat(state.unbind(), -1)
 
-    def _cell(self, given: Tensor, state: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        """One step of a GRU, as ``nn.GRUCell`` defines it; ``given`` is W x + b for r, z, n."""
+    def _encode_distinct(self, tokens: Tensor) -> Tensor:
+        """Run the GRU once over what sentences begin with, or end with, alike."""
+        if tokens.device.type != "cpu" or len(tokens) < ENOUGH_TO_SHARE:
+            return self._encode(tokens)
+        lengths = sentence_lengths(tokens)
+        ways = zip(both_ways(tokens, lengths), *self._scaled(), strict=True)
+        return torch.cat([self._one_way(words, lengths, *known) for words, *known in ways], -1)
+
+    def _one_way(
+        self, tokens: Tensor, lengths: Tensor, table: Tensor, weight: Tensor, bias: Tensor
+    ) -> Tensor:
+        """Run one way over rows of ids, each beginning that they have in common once."""
+        steps, ends = beginnings(tokens, lengths)
+        states = [table.new_zeros(1, self.hidden)]
+        for word, before in steps:
+            state = look_up(states[-1], before)
+            recalled = torch.addmm(bias, state, weight)
+            states.append(self._cell(look_up(table, word), recalled, state))
+        return look_up(torch.cat(states), ends)
+
+    def _scaled(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return W x + b of each word, U and c, as ``nn.GRUCell`` calls them, each way."""
+        words = (self.rate * self.embedding.weight).expand(2, -1, -1)
+        table = torch.baddbmm(self.rate * self.input_bias, words, self.rate * self.input_weight)
+        return table, self.rate * self.state_weight, self.rate * self.state_bias
+
+    def _cell(self, given: Tensor, recalled: Tensor, state: Tensor) -> Tensor:
+        """One step of a GRU, as ``nn.GRUCell`` defines it, from W x + b and U h + c for r, z, n."""
         parts = 2 * self.hidden, self.hidden
-        gates, heard = given.split(parts, -1)
-        opened, recalled = torch.baddbmm(bias, state, weight).split(parts, -1)
+        (gates, heard), (opened, recalled) = given.split(parts, -1), recalled.split(parts, -1)
         reset, keep = torch.sigmoid(gates + opened).chunk(2, -1)
         return torch.lerp(torch.tanh(heard + reset * recalled), state, keep)
+
+
+def both_ways(tokens: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Return rows of ids [N, L], and the same from the last that counts to the first."""
+    step = torch.arange(tokens.shape[1], device=tokens.device)
+    return tokens, tokens.gather(1, (lengths.unsqueeze(1) - 1 - step).clamp_min(0))
+
+
+def beginnings(tokens: Tensor, lengths: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
+    """Find what sentences begin with, each beginning once: a tree of words.
+
+    Args:
+        tokens: ids, int64 [N, L].
+        lengths: how many of each row count, int64 [N].
+
+    Returns:
+        For each word of a sentence the different beginnings that end with it: their last word and
+        which of those one word shorter comes before it, int64 [B] each. And which of all
+        beginnings each sentence is, int64 [N], the empty one counted first.
+
+    >>> tokens = torch.tensor([[5, 6, 7], [5, 6, 8], [5, 9, 0]])
+    >>> steps, ends = beginnings(tokens, torch.tensor([3, 3, 2]))
+    >>> [word.tolist() for word, _ in steps], [before.tolist() for _, before in steps]
+    ([[5], [6, 9], [7, 8]], [[0], [0, 0], [0, 0]])
+    >>> ends.tolist()
+    [4, 5, 3]
+    """
+    words = int(tokens.max()) + 1
+    rows = torch.arange(len(tokens), device=tokens.device)
+    at = torch.zeros_like(lengths)
+    first = [0, 1]
+    steps: list[tuple[Tensor, Tensor]] = []
+    for place in range(int(lengths.max())):
+        rows = rows[lengths[rows] > place]
+        found, at[rows] = torch.unique(at[rows] * words + tokens[rows, place], return_inverse=True)
+        steps.append((found % words, found // words))
+        first.append(first[-1] + len(found))
+    return steps, at + torch.tensor(first, device=at.device)[lengths]
 
 
 def sentence_lengths(tokens: Tensor) -> Tensor:
