@@ -66,13 +66,17 @@ def of_paper(percent: float) -> str:
 def success_rows(
     found: Pieces, reported: dict[str, tuple[float, ...]], phases: tuple[str, ...], heads: list[str]
 ) -> list[dict[str, str]]:
-    """Return the paper's rates and ours, one row each: of phase 1, then of phase 2."""
+    """Return the paper's rates and ours, one row each: of phase 1, then of phase 2.
+
+    A preset that was run on no task has no row.
+    """
     rows = []
+    ran = {preset for _, preset, phase in found if phase in phases}
     for task in TASKS:
         told = [of_paper(percent) for percent in reported[task]]
         rows.append({"task": f"**{task}**", "by": "the paper", "seeds": ""})
         rows[-1] |= dict(zip(heads, told, strict=True))
-        for preset in PRESETS:
+        for preset in filter(ran.__contains__, PRESETS):
             runs = [found.get((task, preset, phase)) for phase in phases]
             shown = ["phase1", *["phase2"] * (len(phases) - 1)]
             values = [success(some, name) for some, name in zip(runs, shown, strict=True)]
