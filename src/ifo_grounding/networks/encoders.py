@@ -16,9 +16,8 @@ from ifo_grounding.networks.cells import Cells, hidden_from_python, look_up
 from ifo_grounding.networks.patches import (
     Windows,
     as_float,
-    distinct_blocks,
+    distinct_looks,
     distinct_patches,
-    distinct_windows,
     patches,
 )
 
@@ -54,17 +53,16 @@ class ConvEncoder(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w]."""
-        windows = distinct_windows(image) if len(self.layers) > 2 else None
-        if windows is None:
+        first, *others = self.convolutions
+        looks = distinct_looks(image, 1 + len(others)) if others else None
+        if looks is None:
             return self.layers(as_float(image))
-        first, second, *others = self.convolutions
-        features, where = _two_layers(first, second, windows), windows.where
-        while others and (found := distinct_blocks(where)):
-            blocks, where = found
+        features = _two_layers(first, others[0], looks.windows)
+        for layer, blocks in zip(others[1:], looks.blocks, strict=False):
             seen = look_up(F.pad(features, (0, 0, 1, 0)), blocks)  # zeros beyond the edges
-            features = _on_blocks(others.pop(0), seen)
-        rest = self.layers[len(self.layers) - 2 * len(others) :]
-        return rest(look_up(features, where).movedim(-1, 1))
+            features = _on_blocks(layer, seen)
+        rest = self.layers[2 * (2 + len(looks.blocks)) :]
+        return rest(look_up(features, looks.where).movedim(-1, 1))
 
     @staticmethod
     def grid(height: int, width: int, layers: int) -> tuple[int, int]:

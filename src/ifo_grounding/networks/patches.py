@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +19,52 @@ FEWEST_WINDOWS = 1 << 12
 """Fewer windows than that are computed as fast as they are compared."""
 MOST_TILES = 1 << 15
 """More distinct tiles than that and the numbers of their combinations could overflow."""
+MOST_REMEMBERED = 1 << 26
+"""Bytes of images up to which it is remembered what was found in them."""
+
+Found = TypeVar("Found")
+
+
+def remembered(
+    find: Callable[[Tensor, int], Found | None],
+) -> Callable[[Tensor, int], Found | None]:
+    """Keep what was found in the last images, for whoever asks about the same ones next.
+
+    Actor and critic, or policy and judge, look at the same images one after the other. To keep a
+    copy of these and to compare all bytes takes a twentieth of the time of finding what repeats.
+    """
+    last: tuple[Tensor, int, Found] | None = None
+
+    @functools.wraps(find)
+    def recall(image: Tensor, number: int) -> Found | None:
+        nonlocal last
+        if not is_plain(image) or torch.is_inference_mode_enabled():
+            return find(image, number)
+        known, words = last, _words(image)
+        if known is not None and known[1] == number and _same(known[0], words):
+            return known[2]
+        found = find(image, number)
+        if found is not None and image.nbytes <= MOST_REMEMBERED:
+            last = words.clone(), number, found
+        return found
+
+    return recall
+
+
+def _words(image: Tensor) -> Tensor:
+    """View pixels as 64-bit words where that is possible: they are compared many times as fast."""
+    fits = image.is_contiguous() and image.shape[-1] % WORD == 0
+    return image.view(torch.int64) if fits else image
+
+
+def _same(words: Tensor, others: Tensor) -> bool:
+    return words.dtype == others.dtype and torch.equal(words, others)
+
+
+def is_plain(image: Tensor) -> bool:
+    """Whether images are bytes on a CPU, which can be compared there and then."""
+    plain = image.dtype == torch.uint8 and image.device.type == "cpu"
+    return plain and not hidden_from_python(image)
 
 
 def as_float(pixels: Tensor) -> Tensor:
@@ -37,6 +85,7 @@ def patches(image: Tensor, patch: int) -> Tensor:
     return _cut(_padded(image, patch), patch, patch)
 
 
+@remembered
 def distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
     """Cut images into their distinct patches; None where that would not pay.
 
@@ -49,8 +98,11 @@ def distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
     Returns:
         Distinct patches, uint8 [U, C, patch * patch], and which lies where, int64 [N, h * w].
     """
-    plain = image.dtype == torch.uint8 and image.device.type == "cpu"
-    if not plain or patch % WORD or hidden_from_python(image):
+    return _distinct_patches(image, patch)
+
+
+def _distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
+    if not is_plain(image) or patch % WORD:
         return None
     words = _padded(image, patch).contiguous().view(torch.int64)
     cut = _cut(words, patch, patch // WORD)
@@ -105,7 +157,7 @@ def distinct_windows(image: Tensor) -> Windows | None:
     rows, _, *size = image.shape
     if any(side % WORD for side in size) or rows * size[0] * size[1] // 16 < FEWEST_WINDOWS:
         return None
-    found = distinct_patches(image, WORD)
+    found = _distinct_patches(image, WORD)
     if found is None or len(found[0]) > MOST_TILES:
         return None
     tiles, where = found[0].view(torch.int64), found[1]  # [U, C, 8], each number a row of pixels
@@ -166,3 +218,35 @@ def distinct_blocks(where: Tensor) -> tuple[Tensor, Tensor] | None:
     if 2 * len(blocks) >= len(index):
         return None
     return blocks, index.view(seen.shape[:3])
+
+
+class Looks(NamedTuple):
+    """What the first of several strided convolutions look at, each distinct thing once."""
+
+    windows: Windows
+    """What the first two look at."""
+    blocks: list[Tensor]
+    """What each that follows looks at, [U, 9], as :func:`distinct_blocks` returns it."""
+    where: Tensor
+    """Which of the last of these lies where, int64 [N, h, w]."""
+
+
+@remembered
+def distinct_looks(image: Tensor, layers: int) -> Looks | None:
+    """Find what strided convolutions of kernel 3 look at, layer by layer, as long as it repeats.
+
+    Args:
+        image: [N, C, H, W].
+        layers: how many convolutions, at least two.
+
+    Returns:
+        What the first of them look at; None where not even the windows of two repeat enough.
+    """
+    windows = distinct_windows(image)
+    if windows is None:
+        return None
+    where, blocks = windows.where, list[Tensor]()
+    while len(blocks) < layers - 2 and (found := distinct_blocks(where)):
+        blocks.append(found[0])
+        where = found[1]
+    return Looks(windows, blocks, where)
