@@ -22,16 +22,17 @@ def searches(monkeypatch):
     return found
 
 
-def encoders(kind):
+def encoder_of(kind):
     torch.manual_seed(0)
     if kind is ConvEncoder:
-        return [ConvEncoder(3, 8, 4) for _ in range(2)]
-    return [lambda image, one=PatchEncoder(3, 8, 8): one.cells(image).maps(6, 6) for _ in range(2)]
+        return ConvEncoder(3, 8, 4)
+    encoder = PatchEncoder(3, 8, 8)
+    return lambda image: encoder.cells(image).maps(6, 6)
 
 
 @pytest.mark.parametrize("kind", [ConvEncoder, PatchEncoder])
 def test_a_second_network_does_not_search_the_same_images_again(kind, images, searches):
-    first, second = encoders(kind)
+    first, second = encoder_of(kind), encoder_of(kind)
     first(images)
     assert searches
     searches.clear()
@@ -45,7 +46,7 @@ def test_a_second_network_does_not_search_the_same_images_again(kind, images, se
 
 @pytest.mark.parametrize("kind", [ConvEncoder, PatchEncoder])
 def test_images_that_change_in_place_are_searched_again(kind, images):
-    encoder = encoders(kind)[0]
+    encoder = encoder_of(kind)
     before = encoder(images)
     images[3] = images[4]
     changed = encoder(images)
