@@ -32,6 +32,8 @@ ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "assets" / "studies.png"
 LEARNED = PICTURE.with_name("babyai.png")
 EFFICIENCY = PICTURE.with_name("efficiency.png")
+FEW = 2000
+"""Demonstrations up to which the README shows a study: with more there is little left to gain."""
 HACKED = ROOT / "results" / "study" / "move-200-film-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
@@ -450,7 +452,8 @@ def page(found: list[dict[str, Any]]) -> str:
 def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
     aside = ("preset", "scenes", "p", *JUDGED)
-    rows = [shown(row, *aside) for row in study_rows() if row["preset"] == "strong"]
+    few = [row for row in study_rows() if int(row["demonstrations"].replace(",", "")) <= FEW]
+    rows = [shown(row, *aside) for row in few if row["preset"] == "strong"]
     text = renewed(text, "results", f"\n{markdown_table(rows)}\n")
     return renewed(text, "babyai", strong_levels())
 
