@@ -139,6 +139,18 @@ def test_values_of_some_worlds_at_a_time_are_those_of_all_at_once(monkeypatch):
             torch.testing.assert_close(one, whole, atol=1e-4, rtol=1e-3)
 
 
+def test_without_discount_it_learns_what_torchrls_estimator_would_teach_it():
+    learned = []
+    for gamma in (0.0, 1e-12):
+        nets = make_networks()
+        self_examine(make_env(), *nets, config(gamma=gamma), seed=0)
+        learned.append([p.detach() for net in nets for p in net.parameters()])
+    for one, other in zip(*learned, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-3)
+    untrained = [p.detach() for net in make_networks() for p in net.parameters()]
+    assert not all(map(torch.equal, learned[0], untrained))
+
+
 def test_a_killed_run_continues_to_the_same_weights(tmp_path):
     whole = make_networks()
     expected = self_examine(make_env(), *whole, config(iterations=3), seed=0)
