@@ -163,6 +163,14 @@ def test_reliability_diagram_shows_every_bin_with_its_interval_and_count():
         reliability_diagram([])
 
 
+def test_labels_of_near_numbers_do_not_touch():
+    curve = {n: wilson(90, 100) for n in (200, 500, 1000, 2000, 5000, 8000, 80_000)}
+    axes = rates_by_number({"move": {"phase 1": curve}}).axes[0]
+    assert list(axes.get_xticks()) == list(curve)
+    labels = [label.get_text() for label in axes.get_xticklabels()]
+    assert labels == ["200", "500", "1K", "2K", "5K", "", "80K"]
+
+
 def test_rates_by_number_shows_each_curve_in_its_panel():
     few, many = wilson(60, 100), wilson(80, 100)
     panels = {"move": {"phase 1": {500: few, 2000: many}, "phase 2": {2000: many}}, "pick": {}}

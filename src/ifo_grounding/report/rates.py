@@ -15,6 +15,9 @@ from ifo_grounding.report.plots import _dress, _figure, _legend, _percent
 from ifo_grounding.report.theme import LIGHT, PALETTE
 from ifo_grounding.stats import Rate
 
+LABELS_APART = 0.1
+"""Share of an axis that two of its labels keep between them."""
+
 
 def compared_rates(groups: Mapping[str, Mapping[str, Rate]], *, title: str = "") -> Figure:
     """Draw rates and their intervals below each other, on an axis that shows small differences.
@@ -103,7 +106,7 @@ def rates_by_number(
             _with_intervals(axes, numbered, PALETTE[place % len(PALETTE)], name)
         for name, rate in (references or {}).get(title, {}).items():
             axes.axhline(rate, color=LIGHT["faint"], linestyle="--", linewidth=1.2, label=name)
-        axes.set_xticks(numbers, [_short(number) for number in numbers])
+        axes.set_xticks(numbers, _labels(numbers))
         axes.set_xlim(0.8 * numbers[0], 1.25 * numbers[-1])
         axes.minorticks_off()
         _percent(axes, max(0.0, 0.1 * math.floor(10 * low)))
@@ -121,9 +124,16 @@ def rates_by_number(
     return figure
 
 
-def _short(number: int) -> str:
-    """Return 500 or 2K, so that labels do not run into each other."""
-    return f"{number / 1000:g}K" if number >= 1000 else str(number)
+def _labels(numbers: Sequence[int]) -> list[str]:
+    """Label numbers as 500 or 2K, but none so near to the last label that they would touch."""
+    apart = (numbers[-1] / numbers[0]) ** LABELS_APART
+    labels, last = [], 0.0
+    for number in numbers:
+        fits = number >= apart * last
+        short = f"{number / 1000:g}K" if number >= 1000 else str(number)
+        labels.append(short if fits else "")
+        last = number if fits else last
+    return labels
 
 
 def _with_intervals(
