@@ -169,7 +169,11 @@ def content() -> str:
         commands_note(found.values()),
         "## Ablations",
         "What one choice does where demonstrations are few, preset `strong`. Gains of phase 2 over"
-        " phase 1 and differences from the whole, both greedy, are paired by scene, in points.",
+        " phase 1 and differences from the whole, both greedy, are paired by scene, in points. The"
+        " paper's reward is paid for every action, and discounted here as the goal reward is: a"
+        " policy then earns most that never stops"
+        " ([an example](phase2.md#an-example-of-a-reward-that-is-exploited)). Preset `paper` does not"
+        " discount it.",
         ablation_content(),
     ]
     return "\n\n".join(part for part in parts if part)
