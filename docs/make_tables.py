@@ -172,8 +172,8 @@ def content() -> str:
         " phase 1 and differences from the whole, both greedy, are paired by scene, in points. The"
         " paper's reward is paid for every action, and discounted here as the goal reward is: a"
         " policy then earns most that never stops"
-        " ([an example](phase2.md#an-example-of-a-reward-that-is-exploited)). Preset `paper` credits"
-        " each action with its own reward alone.",
+        " ([an example](phase2.md#an-example-of-a-reward-that-is-exploited)). Preset `paper`"
+        " credits each action with its own reward alone.",
         ablation_content(),
     ]
     return "\n\n".join(part for part in parts if part)
