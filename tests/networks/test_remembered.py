@@ -82,3 +82,10 @@ def test_bytes_and_words_of_the_same_shape_are_told_apart():
     few = torch.zeros(2, 3, 8, 1, dtype=torch.uint8)
     assert find(words, 1) == words.shape
     assert find(few, 1) == few.shape
+
+
+@pytest.mark.parametrize("kind", [ConvEncoder, PatchEncoder])
+def test_images_may_begin_anywhere_in_a_buffer(kind, images):
+    encoder = encoder_of(kind)
+    buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), images.flatten()])
+    torch.testing.assert_close(encoder(buffer[3:].view_as(images)), encoder(images))

@@ -193,7 +193,7 @@ class InstructionEncoder(nn.Module):
         raise NotImplementedError
 
     def _encode_distinct(self, tokens: Tensor) -> Tensor:
-        """Encode different instructions, none of them longer than the table of ids is wide."""
+        """Encode instructions [U, L] of which no two are the same."""
         return self._encode(tokens)
 
 

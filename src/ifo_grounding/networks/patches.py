@@ -53,8 +53,14 @@ def remembered(
 
 def _words(image: Tensor) -> Tensor:
     """View pixels as 64-bit words where that is possible: they are compared many times as fast."""
-    fits = image.is_contiguous() and image.shape[-1] % WORD == 0
-    return image.view(torch.int64) if fits else image
+    fits = image.shape[-1] % WORD == 0 and image.storage_offset() % WORD == 0
+    return image.view(torch.int64) if fits and image.is_contiguous() else image
+
+
+def _as_words(image: Tensor) -> Tensor:
+    """View pixels, whose rows are whole words, as 64-bit words, or a copy that can be viewed so."""
+    words = _words(image.contiguous())
+    return words if words.dtype == torch.int64 else image.clone().view(torch.int64)
 
 
 def _same(words: Tensor, others: Tensor) -> bool:
@@ -104,7 +110,7 @@ def distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
 def _distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
     if not is_plain(image) or patch % WORD:
         return None
-    words = _padded(image, patch).contiguous().view(torch.int64)
+    words = _as_words(_padded(image, patch))
     cut = _cut(words, patch, patch // WORD)
     rows, index = distinct_rows(cut.flatten(0, 2))
     if 2 * len(rows) > len(index):
@@ -188,7 +194,7 @@ def distinct_windows(image: Tensor) -> Windows | None:
     place = torch.arange(index.numel(), device=image.device)
     place = place.new_zeros(len(known)).scatter_(0, index.flatten(), place)
 
-    words = F.pad(image.contiguous().view(torch.int64), (1, 0, 3, 0)).unfold(2, 7, 4)
+    words = F.pad(_as_words(image), (1, 0, 3, 0)).unfold(2, 7, 4)
     row, across = place // (2 * width) % (2 * height), place % (2 * width)
     which = place // (4 * height * width)
     before, inside = (words[which, :, row, across // 2 + step] for step in (0, 1))  # [U, C, 7]
