@@ -409,7 +409,8 @@ def with_prior() -> str:
         for (_, n, kind, _), runs in practised().items()
         if kind == "strong" and runs[0]["options"]["imitate"].get("prior")
     }
-    told = " and ".join(f"{n:,}" for n in sorted(numbers)) or "none"
+    *most, last = [f"{n:,}" for n in sorted(numbers)] or ["none"]
+    told = f"{', '.join(most)} and {last}" if most else last
     return f"Imitated with the [prior](phase1.md#few-demonstrations): {told}; the others without."
 
 
