@@ -16,6 +16,20 @@ from ifo_grounding.errors import UserError
 PIXELS_PER_WORD = 8
 
 
+def as_words(pixels: Tensor) -> Tensor:
+    """View bytes [..., W], W a multiple of 8, as int64 words [..., W / 8].
+
+    They are copied where they do not lie in a row, or begin within a word of their memory.
+
+    >>> as_words(torch.ones(11, dtype=torch.uint8)[3:]).tolist() == [0x0101010101010101]
+    True
+    """
+    row = pixels.contiguous()
+    if row.storage_offset() % PIXELS_PER_WORD:
+        row = row.clone()
+    return row.view(torch.int64)
+
+
 def words(tiles: Tensor) -> Tensor:
     """View tiles, uint8 [N, C, T, T], as int64 words [N, C, T, T / 8].
 
@@ -26,7 +40,7 @@ def words(tiles: Tensor) -> Tensor:
         raise UserError(f"tiles must be uint8 [N, C, T, T], got {tiles.dtype} {list(tiles.shape)}")
     if tiles.shape[-1] % PIXELS_PER_WORD:
         raise UserError(f"tile size must be a multiple of 8, got {tiles.shape[-1]}")
-    return tiles.contiguous().view(torch.int64)
+    return as_words(tiles)
 
 
 def assemble(table: Tensor, index: Tensor) -> Tensor:

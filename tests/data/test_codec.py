@@ -210,3 +210,10 @@ def test_misfits_are_refused():
         FrameCodec((3, 24, 16), torch.zeros(2, 3, 8, 8, dtype=torch.uint8))
     with pytest.raises(UserError, match="no frames"):
         FrameCodec.from_tiles(torch.zeros(2, 3, 8, 8, dtype=torch.uint8), [])
+
+
+def test_frames_may_begin_anywhere_in_a_buffer():
+    frames = torch.arange(4 * 3 * 16 * 16).view(4, 3, 16, 16).to(torch.uint8)
+    buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), frames.flatten()])
+    codec = FrameCodec.fit(frames, 8)
+    assert torch.equal(codec.encode(buffer[3:].view_as(frames)), codec.encode(frames))

@@ -271,7 +271,7 @@ def decode(words: Tensor, codes: Tensor) -> Tensor:
 def cut(frames: Tensor, tile_size: int) -> Tensor:
     """Cut frames, uint8 [F, C, H, W], into tiles as words, int64 [F * rows * columns, K]."""
     count, channels, height, width = frames.shape
-    words = frames.contiguous().view(torch.int64)
+    words = mosaic.as_words(frames)
     across = tile_size // mosaic.PIXELS_PER_WORD
     grid = (count, channels, height // tile_size, tile_size, width // tile_size, across)
     return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)

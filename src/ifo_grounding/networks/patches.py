@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
+from ifo_grounding.mosaic import as_words
 from ifo_grounding.networks.cells import hidden_from_python
 
-WORD = 8
-"""Pixels that are compared at once."""
 FEWEST_WINDOWS = 1 << 12
 """Fewer windows than that are computed as fast as they are compared."""
 MOST_TILES = 1 << 15
@@ -33,38 +33,24 @@ def remembered(
     Actor and critic, or policy and judge, look at the same images one after the other. To keep a
     copy of these and to compare all bytes takes a twentieth of the time of finding what repeats.
     """
-    last: tuple[Tensor, int, Found] | None = None
+    last: tuple[Tensor, tuple[int, torch.Size], Found] | None = None
 
     @functools.wraps(find)
     def recall(image: Tensor, number: int) -> Found | None:
         nonlocal last
         if not is_plain(image) or torch.is_inference_mode_enabled():
             return find(image, number)
-        known, words = last, _words(image)
-        if known is not None and known[1] == number and _same(known[0], words):
+        # Words are compared many times as fast as bytes.
+        words = image if image.shape[-1] % WORD else as_words(image)
+        known, asked = last, (number, image.shape)
+        if known is not None and known[1] == asked and torch.equal(known[0], words):
             return known[2]
         found = find(image, number)
         if found is not None and image.nbytes <= MOST_REMEMBERED:
-            last = words.clone(), number, found
+            last = words.clone(), asked, found
         return found
 
     return recall
-
-
-def _words(image: Tensor) -> Tensor:
-    """View pixels as 64-bit words where that is possible: they are compared many times as fast."""
-    fits = image.shape[-1] % WORD == 0 and image.storage_offset() % WORD == 0
-    return image.view(torch.int64) if fits and image.is_contiguous() else image
-
-
-def _as_words(image: Tensor) -> Tensor:
-    """View pixels, whose rows are whole words, as 64-bit words, or a copy that can be viewed so."""
-    words = _words(image.contiguous())
-    return words if words.dtype == torch.int64 else image.clone().view(torch.int64)
-
-
-def _same(words: Tensor, others: Tensor) -> bool:
-    return words.dtype == others.dtype and torch.equal(words, others)
 
 
 def is_plain(image: Tensor) -> bool:
@@ -110,7 +96,7 @@ def distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
 def _distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
     if not is_plain(image) or patch % WORD:
         return None
-    words = _as_words(_padded(image, patch))
+    words = as_words(_padded(image, patch))
     cut = _cut(words, patch, patch // WORD)
     rows, index = distinct_rows(cut.flatten(0, 2))
     if 2 * len(rows) > len(index):
@@ -194,7 +180,7 @@ def distinct_windows(image: Tensor) -> Windows | None:
     place = torch.arange(index.numel(), device=image.device)
     place = place.new_zeros(len(known)).scatter_(0, index.flatten(), place)
 
-    words = F.pad(_as_words(image), (1, 0, 3, 0)).unfold(2, 7, 4)
+    words = F.pad(as_words(image), (1, 0, 3, 0)).unfold(2, 7, 4)
     row, across = place // (2 * width) % (2 * height), place % (2 * width)
     which = place // (4 * height * width)
     before, inside = (words[which, :, row, across // 2 + step] for step in (0, 1))  # [U, C, 7]

@@ -11,6 +11,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
+from ifo_grounding.mosaic import PIXELS_PER_WORD, as_words
 from ifo_grounding.seeding import generator
 from ifo_grounding.transforms._common import InstructionTransform
 from ifo_grounding.transforms.choosing import check_pool
@@ -189,8 +190,7 @@ def frame_hash(pixels: Tensor) -> Tensor:
     2
     """
     flat = pixels.flatten(1).to(torch.uint8)
-    flat = torch.nn.functional.pad(flat, (0, -flat.shape[1] % 8)).contiguous()
-    words = flat.view(torch.int64)
+    words = as_words(torch.nn.functional.pad(flat, (0, -flat.shape[1] % PIXELS_PER_WORD)))
     # Odd multipliers keep every bit; int64 arithmetic wraps around, the same on any device.
     place = torch.arange(words.shape[1], device=words.device) * 2 + 1
     return ((words ^ (words >> 29)) * (place * 0x2545F4914F6CDD1D)).sum(-1)
