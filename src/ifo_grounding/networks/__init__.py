@@ -3,13 +3,7 @@
 from ifo_grounding.networks.attention import attention_maps
 from ifo_grounding.networks.building import Blueprint
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import (
-    ConvEncoder,
-    ConvInstructionEncoder,
-    GRUInstructionEncoder,
-    InstructionEncoder,
-    PatchEncoder,
-)
+from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
 from ifo_grounding.networks.fusion import (
     CellCount,
     CellLinear,
@@ -28,6 +22,11 @@ from ifo_grounding.networks.persistence import load, save
 from ifo_grounding.networks.policy import PolicyNetwork, ValueNetwork, make_policy, make_value
 from ifo_grounding.networks.reward import RewardNetwork, make_reward_model
 from ifo_grounding.networks.scoring import PairScorer, SentenceScorer
+from ifo_grounding.networks.sentences import (
+    ConvInstructionEncoder,
+    GRUInstructionEncoder,
+    InstructionEncoder,
+)
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.sharing import from_pretrained, save_pretrained
 from ifo_grounding.networks.word_scoring import WordScorer

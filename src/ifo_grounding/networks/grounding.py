@@ -17,9 +17,10 @@ from torch import Tensor, nn
 
 from ifo_grounding.networks.cells import hidden_from_python, look_up
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import PatchEncoder, over_words, without_padding
+from ifo_grounding.networks.encoders import PatchEncoder
 from ifo_grounding.networks.fusion import cell_places
 from ifo_grounding.networks.looks import EVIDENCE, ColourAndForm, Looks
+from ifo_grounding.networks.sentences import over_words, without_padding
 from ifo_grounding.networks.shapes import Shapes, patch_size
 
 ROLE, SIDE = 8, 4

@@ -212,7 +212,7 @@ def distinct_blocks(where: Tensor) -> tuple[Tensor, Tensor] | None:
     return blocks, index.view(seen.shape[:3])
 
 
-class Looks(NamedTuple):
+class Views(NamedTuple):
     """What the first of several strided convolutions look at, each distinct thing once."""
 
     windows: Windows
@@ -224,7 +224,7 @@ class Looks(NamedTuple):
 
 
 @remembered
-def distinct_looks(image: Tensor, layers: int) -> Looks | None:
+def distinct_views(image: Tensor, layers: int) -> Views | None:
     """Find what strided convolutions of kernel 3 look at, layer by layer, as long as it repeats.
 
     Args:
@@ -241,4 +241,4 @@ def distinct_looks(image: Tensor, layers: int) -> Looks | None:
     while len(blocks) < layers - 2 and (found := distinct_blocks(where)):
         blocks.append(found[0])
         where = found[1]
-    return Looks(windows, blocks, where)
+    return Views(windows, blocks, where)

@@ -14,14 +14,7 @@ from torch import Tensor, nn
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.cells import Cells, Pairs, hidden_from_python, look_up, pair_up
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import (
-    ConvEncoder,
-    ConvInstructionEncoder,
-    GRUInstructionEncoder,
-    InstructionEncoder,
-    PatchEncoder,
-    begin_before_relu,
-)
+from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder, begin_before_relu
 from ifo_grounding.networks.fusion import (
     GatedAttention,
     ResidualBlock,
@@ -29,6 +22,11 @@ from ifo_grounding.networks.fusion import (
     SpatialReadout,
 )
 from ifo_grounding.networks.grounding import GroundedTrunk
+from ifo_grounding.networks.sentences import (
+    ConvInstructionEncoder,
+    GRUInstructionEncoder,
+    InstructionEncoder,
+)
 from ifo_grounding.networks.shapes import Shapes, patch_size
 
 

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.networks.cells import Cells, Kinds, group_cells, hidden_from_python, look_up
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import without_padding
 from ifo_grounding.networks.fusion import cell_places
 from ifo_grounding.networks.grounding import (
     AROUND,
@@ -23,6 +22,7 @@ from ifo_grounding.networks.grounding import (
 )
 from ifo_grounding.networks.looks import ColourAndForm
 from ifo_grounding.networks.scoring import ROWS_AT_ONCE, PairScorer, slices
+from ifo_grounding.networks.sentences import without_padding
 from ifo_grounding.networks.shapes import Shapes, patch_size
 from ifo_grounding.networks.trunk import grid, head, same_batch
 

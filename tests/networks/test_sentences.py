@@ -1,0 +1,147 @@
+import pytest
+import torch
+from torch import nn
+from torch.nn.utils.rnn import pack_padded_sequence
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import ConvInstructionEncoder, GRUInstructionEncoder
+from ifo_grounding.networks.sentences import beginnings
+from ifo_grounding.tasks import TASKS, VOCABULARY, grammar
+
+
+def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) -> torch.Tensor:
+    source = torch.Generator().manual_seed(seed)
+    tokens = torch.randint(1, vocabulary, (rows, length), generator=source)
+    lengths = torch.randint(1, length + 1, (rows, 1), generator=source)
+    return tokens * (torch.arange(length) < lengths)
+
+
+@pytest.fixture(params=[GRUInstructionEncoder, ConvInstructionEncoder])
+def encoder(request):
+    torch.manual_seed(0)
+    return request.param(40, embedding=8, hidden=16)
+
+
+def reference_gru(encoder: GRUInstructionEncoder) -> nn.GRU:
+    gru = nn.GRU(8, 16, batch_first=True, bidirectional=True)
+    with torch.no_grad():
+        for way, suffix in enumerate(("l0", "l0_reverse")):
+            getattr(gru, f"weight_ih_{suffix}").copy_(encoder.input_weight[way].T)
+            getattr(gru, f"weight_hh_{suffix}").copy_(encoder.state_weight[way].T)
+            getattr(gru, f"bias_ih_{suffix}").copy_(encoder.input_bias[way, 0])
+            getattr(gru, f"bias_hh_{suffix}").copy_(encoder.state_bias[way, 0])
+    return gru
+
+
+def test_the_papers_encoder_is_the_bidirectional_gru_of_pytorch_over_packed_sentences():
+    torch.manual_seed(0)
+    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16)
+    tokens = sentences(50)
+    packed = pack_padded_sequence(
+        encoder.embedding(tokens), (tokens != 0).sum(1), batch_first=True, enforce_sorted=False
+    )
+    _, state = reference_gru(encoder)(packed)
+    torch.testing.assert_close(encoder(tokens), torch.cat([state[0], state[1]], -1))
+
+
+def test_padding_changes_nothing(encoder):
+    tokens = torch.tensor([[3, 7, 2]])
+    longer = torch.tensor([[3, 7, 2, 0, 0, 0]])
+    torch.testing.assert_close(encoder(tokens), encoder(longer))
+    mixed = encoder(torch.cat([longer, torch.zeros(2, 6, dtype=torch.int64)]))
+    assert torch.equal(mixed[1], mixed[2])
+    if isinstance(encoder, GRUInstructionEncoder):
+        assert torch.equal(mixed[1:], torch.zeros(2, 32))
+    torch.testing.assert_close(mixed[:1], encoder(tokens))
+
+
+def test_word_order_matters(encoder):
+    first, second = encoder(torch.tensor([[3, 7, 2], [2, 7, 3]]))
+    assert not torch.allclose(first, second)
+
+
+def test_no_rows_give_no_features(encoder):
+    assert encoder(torch.zeros(0, 16, dtype=torch.int64)).shape == (0, 32)
+
+
+@pytest.mark.parametrize("bad", [-1, 40])
+def test_ids_outside_the_vocabulary_are_refused(encoder, bad):
+    with pytest.raises(UserError, match=r"knows 0 to 39"):
+        encoder(torch.tensor([[1, bad, 2]]))
+
+
+def test_each_distinct_instruction_is_encoded_once(encoder, monkeypatch):
+    rows = []
+    encode = type(encoder)._encode_distinct
+    monkeypatch.setattr(
+        type(encoder),
+        "_encode_distinct",
+        lambda self, tokens: rows.append(len(tokens)) or encode(self, tokens),
+    )
+    pool = sentences(12)
+    tokens = pool[torch.randint(12, (200,))]
+    features = encoder(tokens)
+    assert rows == [len(torch.unique(tokens, dim=0))]
+    torch.testing.assert_close(features, encode(encoder, tokens))
+
+
+def test_gradients_are_those_of_encoding_every_row_and_repeat_exactly(encoder):
+    tokens = sentences(12)[torch.randint(12, (200,))]
+    target = torch.randn(200, 32)
+
+    def gradients(encode):
+        encoder.zero_grad()
+        (encode(tokens) * target).sum().backward()
+        return [parameter.grad.clone() for parameter in encoder.parameters()]
+
+    once = gradients(encoder)
+    for grad, every in zip(once, gradients(encoder._encode), strict=True):
+        torch.testing.assert_close(grad, every, rtol=1e-4, atol=1e-5)
+    assert all(map(torch.equal, once, gradients(encoder)))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(task, monkeypatch):
+    monkeypatch.setattr(f"{beginnings.__module__}.ENOUGH_TO_SHARE", 0)
+    torch.manual_seed(0)
+    encoder = GRUInstructionEncoder(len(VOCABULARY), embedding=8, hidden=16, rate=0.1).double()
+    known = grammar(task).tokens
+    tokens = torch.cat([known[torch.randint(len(known), (300,))], known[:1] * 0])
+    target = torch.randn(len(tokens), 32, dtype=torch.float64)
+
+    def encoded(encode):
+        encoder.zero_grad()
+        features = encode(tokens)
+        (features * target).sum().backward()
+        return [features.detach(), *(parameter.grad.clone() for parameter in encoder.parameters())]
+
+    once = encoded(encoder)
+    for part, every in zip(once, encoded(encoder._encode), strict=True):
+        torch.testing.assert_close(part, every)
+    assert all(map(torch.equal, once, encoded(encoder)))
+
+
+def test_ids_of_padding_between_words_are_words_of_their_own(monkeypatch):
+    monkeypatch.setattr(f"{beginnings.__module__}.ENOUGH_TO_SHARE", 0)
+    torch.manual_seed(0)
+    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16)
+    rows = torch.cartesian_prod(*[torch.arange(3)] * 5)  # any of five may be padding
+    torch.testing.assert_close(encoder._encode_distinct(rows), encoder._encode(rows))
+
+
+def test_beginnings_are_fewer_than_words():
+    tokens = grammar("pick-out").tokens
+    lengths = (tokens != 0).sum(1)
+    steps, ends = beginnings(tokens, lengths)
+    assert len(ends.unique()) == len(tokens)
+    for length, (words, _) in enumerate(steps, start=1):
+        longer = tokens[lengths >= length, :length]
+        assert len(words) == len(longer.unique(dim=0))
+    assert sum(len(words) for words, _ in steps) < int(lengths.sum()) / 4
+
+
+def test_encoder_works_under_vmap(encoder):
+    tokens = sentences(8).reshape(2, 4, 16)
+    torch.testing.assert_close(
+        torch.vmap(encoder)(tokens), encoder(tokens.flatten(0, 1)).reshape(2, 4, 32)
+    )
