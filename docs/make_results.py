@@ -469,8 +469,9 @@ def page(found: list[dict[str, Any]]) -> str:
 def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
     aside = ("preset", "scenes", "p", *JUDGED)
-    few = [row for row in study_rows() if int(row["demonstrations"].replace(",", "")) <= FEW]
-    rows = [shown(row, *aside) for row in few if row["preset"] == "strong"]
+    found = zip(practised(), study_rows(), strict=True)
+    few = [row for (_, n, *_), row in found if n <= FEW and row["preset"] == "strong"]
+    rows = [shown(row, *aside) for row in few]
     text = renewed(text, "results", f"\n{markdown_table(rows)}\n")
     return renewed(text, "babyai", strong_levels())
 

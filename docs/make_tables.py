@@ -72,11 +72,12 @@ def success_rows(
     """
     rows = []
     ran = {preset for _, preset, phase in found if phase in phases}
+    presets = [preset for preset in PRESETS if preset in ran]
     for task in TASKS:
         told = [of_paper(percent) for percent in reported[task]]
         rows.append({"task": f"**{task}**", "by": "the paper", "seeds": ""})
         rows[-1] |= dict(zip(heads, told, strict=True))
-        for preset in filter(ran.__contains__, PRESETS):
+        for preset in presets:
             runs = [found.get((task, preset, phase)) for phase in phases]
             shown = ["phase1", *["phase2"] * (len(phases) - 1)]
             values = [success(some, name) for some, name in zip(runs, shown, strict=True)]
