@@ -1,7 +1,7 @@
 import pytest
 import torch
 from torch import nn
-from torch.nn.utils.rnn import pack_padded_sequence
+from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import ConvInstructionEncoder, GRUInstructionEncoder
@@ -16,7 +16,11 @@ def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) 
     return tokens * (torch.arange(length) < lengths)
 
 
-@pytest.fixture(params=[GRUInstructionEncoder, ConvInstructionEncoder])
+def mean_gru(*sizes: int, **options: int) -> GRUInstructionEncoder:
+    return GRUInstructionEncoder(*sizes, **options, pooling="mean")
+
+
+@pytest.fixture(params=[GRUInstructionEncoder, mean_gru, ConvInstructionEncoder])
 def encoder(request):
     torch.manual_seed(0)
     return request.param(40, embedding=8, hidden=16)
@@ -33,15 +37,24 @@ def reference_gru(encoder: GRUInstructionEncoder) -> nn.GRU:
     return gru
 
 
-def test_the_papers_encoder_is_the_bidirectional_gru_of_pytorch_over_packed_sentences():
+@pytest.mark.parametrize("pooling", ["last", "mean"])
+def test_the_papers_encoder_is_the_bidirectional_gru_of_pytorch_over_packed_sentences(pooling):
     torch.manual_seed(0)
-    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16)
+    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16, pooling=pooling)
     tokens = sentences(50)
     packed = pack_padded_sequence(
         encoder.embedding(tokens), (tokens != 0).sum(1), batch_first=True, enforce_sorted=False
     )
-    _, state = reference_gru(encoder)(packed)
-    torch.testing.assert_close(encoder(tokens), torch.cat([state[0], state[1]], -1))
+    states, last = reference_gru(encoder)(packed)
+    padded, lengths = pad_packed_sequence(states, batch_first=True)
+    mean = padded.sum(1) / lengths.unsqueeze(1)
+    expected = mean if pooling == "mean" else torch.cat([last[0], last[1]], -1)
+    torch.testing.assert_close(encoder(tokens), expected)
+
+
+def test_an_unknown_pooling_is_refused():
+    with pytest.raises(UserError, match="unknown pooling 'max': choose one of 'last', 'mean'"):
+        GRUInstructionEncoder(40, embedding=8, hidden=16, pooling="max")
 
 
 def test_padding_changes_nothing(encoder):
@@ -100,11 +113,16 @@ def test_gradients_are_those_of_encoding_every_row_and_repeat_exactly(encoder):
     assert all(map(torch.equal, once, gradients(encoder)))
 
 
+@pytest.mark.parametrize("pooling", ["last", "mean"])
 @pytest.mark.parametrize("task", TASKS)
-def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(task, monkeypatch):
+def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(
+    task, pooling, monkeypatch
+):
     monkeypatch.setattr(f"{beginnings.__module__}.ENOUGH_TO_SHARE", 0)
     torch.manual_seed(0)
-    encoder = GRUInstructionEncoder(len(VOCABULARY), embedding=8, hidden=16, rate=0.1).double()
+    encoder = GRUInstructionEncoder(
+        len(VOCABULARY), embedding=8, hidden=16, rate=0.1, pooling=pooling
+    ).double()
     known = grammar(task).tokens
     tokens = torch.cat([known[torch.randint(len(known), (300,))], known[:1] * 0])
     target = torch.randn(len(tokens), 32, dtype=torch.float64)
@@ -121,10 +139,11 @@ def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(ta
     assert all(map(torch.equal, once, encoded(encoder)))
 
 
-def test_ids_of_padding_between_words_are_words_of_their_own(monkeypatch):
+@pytest.mark.parametrize("pooling", ["last", "mean"])
+def test_ids_of_padding_between_words_are_words_of_their_own(pooling, monkeypatch):
     monkeypatch.setattr(f"{beginnings.__module__}.ENOUGH_TO_SHARE", 0)
     torch.manual_seed(0)
-    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16)
+    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16, pooling=pooling)
     rows = torch.cartesian_prod(*[torch.arange(3)] * 5)  # any of five may be padding
     torch.testing.assert_close(encoder._encode_distinct(rows), encoder._encode(rows))
 

@@ -7,6 +7,8 @@ from typing import Any
 
 from ifo_grounding.errors import UserError, check_choice
 
+POOLINGS = ("last", "mean")
+"""Which states of a GRU make an encoded sentence."""
 KINDS = ("inverse", "policy", "value", "instruction", "reward", "goal")
 """The networks of this package."""
 
@@ -65,11 +67,15 @@ class NetworkConfig:
     """How fast the sentence's encoder and the gates learn, by the rest (``paper``: 0.1). Their
     weights are kept divided by it, so that an optimiser such as Adam, whose steps do not depend on
     the scale of a gradient, takes smaller ones (an equalised rate, Karras et al. 2018)."""
+    sentence_pooling: str = "last"
+    """Which states of a GRU (``words="gru"``) make an encoded sentence: the ``"last"`` of each way,
+    or their ``"mean"`` over words (``paper``)."""
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, PRESETS)
         check_choice("matching", self.matching, ("sentence", "words"))
         check_choice("words", self.words, ("gru", "conv"))
+        check_choice("sentence_pooling", self.sentence_pooling, POOLINGS)
         check_choice("precision", self.precision, (None, "auto", "fp32", "bf16"))
         for name in ("features", "embedding", "hidden"):
             if getattr(self, name) < 1:
@@ -117,6 +123,7 @@ _PAPER: dict[str, Any] = {
     "dropout": 0.25,
     "head_hidden": (128, 64),
     "sentence_rate": 0.1,
+    "sentence_pooling": "mean",
 }
 _FILM: dict[str, Any] = {
     "features": 64,

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-GATE_GAIN = 6.0
+GATE_GAIN = 9.0
 """Standard deviation of a gate's logit to begin with, by that of an instruction's features."""
 
 

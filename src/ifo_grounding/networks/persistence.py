@@ -24,6 +24,8 @@ from ifo_grounding.networks.reward import make_reward_model
 from ifo_grounding.networks.shapes import Shapes
 
 FORMAT = "ifo-grounding network 1"
+BEFORE: dict[str, Any] = {"sentence_rate": 1.0, "sentence_pooling": "last"}
+"""Options that files made before them lack, as those networks were."""
 MAKERS: dict[str, Callable[..., Any]] = {
     "inverse": make_inverse,
     "policy": make_policy,
@@ -90,7 +92,7 @@ def load(
         shapes = Shapes(
             **{**content["shapes"], "image_shape": tuple(content["shapes"]["image_shape"])}
         )
-        config = {"sentence_rate": 1.0, **content["config"]}  # files made before it have none
+        config = {**BEFORE, **content["config"]}
         module = MAKERS[found](shapes, device=device, seed=0, **options, **config)
         module.load_state_dict(weights)
     except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:

@@ -9,8 +9,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.networks.cells import hidden_from_python, look_up
+from ifo_grounding.networks.config import POOLINGS
 
 
 def without_padding(tokens: Tensor, words: int) -> Tensor:
@@ -112,8 +113,9 @@ ENOUGH_TO_SHARE = 128
 class GRUInstructionEncoder(InstructionEncoder):
     """Word embeddings and a bidirectional GRU (the paper's experimental settings).
 
-    The feature is the forward state after the last word beside the backward state after the first;
-    an instruction of padding alone is zeros.
+    The feature is the mean of the states after every word, the forward ones beside the backward
+    ones, or only the last of each way, after which words in the middle of a long sentence are
+    hardly heard to begin with. An instruction of padding alone is zeros.
 
     The recurrence is written out, where ``nn.GRU`` would do, because packed sequences do not work
     under ``torch.vmap``, which TorchRL's value estimators use.
@@ -126,6 +128,7 @@ class GRUInstructionEncoder(InstructionEncoder):
         embedding: size of a word's embedding.
         hidden: size of the state, each way.
         rate: how fast it learns, by the rest of a network: weights are kept divided by it.
+        pooling: ``"mean"`` or ``"last"``: which states make the feature.
 
     >>> encoder = GRUInstructionEncoder(vocabulary_size=40, embedding=8, hidden=64)
     >>> encoder(torch.randint(40, (5, 16))).shape
@@ -133,10 +136,17 @@ class GRUInstructionEncoder(InstructionEncoder):
     """
 
     def __init__(
-        self, vocabulary_size: int, embedding: int, hidden: int, rate: float = 1.0
+        self,
+        vocabulary_size: int,
+        embedding: int,
+        hidden: int,
+        rate: float = 1.0,
+        pooling: str = "last",
     ) -> None:
         super().__init__(vocabulary_size, embedding, hidden)
         self.rate = rate
+        check_choice("pooling", pooling, POOLINGS)
+        self.pooling = pooling
         self.input_weight = nn.Parameter(torch.empty(2, embedding, 3 * hidden))
         self.input_bias = nn.Parameter(torch.zeros(2, 1, 3 * hidden))
         self.state_weight = nn.Parameter(torch.empty(2, hidden, 3 * hidden))
@@ -156,12 +166,13 @@ class GRUInstructionEncoder(InstructionEncoder):
         ways = zip(both_ways(tokens, lengths), table, strict=True)
         gates = torch.stack([F.embedding(words, known) for words, known in ways])
         alive = (step < lengths.unsqueeze(1)).unsqueeze(-1)
-        state = gates.new_zeros(2, len(tokens), self.hidden)
+        state = total = gates.new_zeros(2, len(tokens), self.hidden)
         # Split once: each slice of its own would get a gradient as large as the whole.
         for given, counts in zip(gates.unbind(2), alive.unbind(1), strict=True):
             recalled = torch.baddbmm(bias, state, weight)
             state = torch.where(counts, self._cell(given, recalled, state), state)
-        return torch.cat(state.unbind(), -1)
+            total = total + state * counts if self.pooling == "mean" else state
+        return torch.cat(self._pooled(total, lengths).unbind(), -1)
 
     def _encode_distinct(self, tokens: Tensor) -> Tensor:
         """Run the GRU once over what sentences begin with, or end with, alike."""
@@ -176,12 +187,21 @@ class GRUInstructionEncoder(InstructionEncoder):
     ) -> Tensor:
         """Run one way over rows of ids, each beginning that they have in common once."""
         steps, ends = beginnings(tokens, lengths)
-        states = [table.new_zeros(1, self.hidden)]
+        state = total = table.new_zeros(1, self.hidden)
+        totals = [total]
         for word, before in steps:
-            state = look_up(states[-1], before)
+            state = look_up(state, before)
             recalled = torch.addmm(bias, state, weight)
-            states.append(self._cell(look_up(table, word), recalled, state))
-        return look_up(torch.cat(states), ends)
+            state = self._cell(look_up(table, word), recalled, state)
+            total = look_up(total, before) + state if self.pooling == "mean" else state
+            totals.append(total)
+        return self._pooled(look_up(torch.cat(totals), ends), lengths)
+
+    def _pooled(self, total: Tensor, lengths: Tensor) -> Tensor:
+        """Return the feature of one way or both, [..., N, hidden], from the sum of its states."""
+        if self.pooling == "last":
+            return total
+        return total / lengths.clamp_min(1).unsqueeze(-1).to(total.dtype)
 
     def _scaled(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return W x + b of each word, U and c, as ``nn.GRUCell`` calls them, each way."""

@@ -167,7 +167,7 @@ def instruction_encoder(shapes: Shapes, config: NetworkConfig) -> InstructionEnc
     sizes = shapes.vocabulary_size, config.embedding, config.hidden
     if config.words == "conv":
         return ConvInstructionEncoder(*sizes)
-    return GRUInstructionEncoder(*sizes, config.sentence_rate)
+    return GRUInstructionEncoder(*sizes, config.sentence_rate, config.sentence_pooling)
 
 
 class Trunk(nn.Module):
