@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from ifo_grounding.errors import UserError
 from ifo_grounding.objectives.mixture import MixtureEstimate, best_bin_estimate
 from ifo_grounding.objectives.pairs import MOST_REMOVED, NegativeInstructions
 
@@ -47,6 +48,54 @@ def test_the_estimated_share_is_removed_after_the_warm_up():
     assert negatives.keep(scores).all()
     negatives.progress = 0.6
     assert negatives.keep(scores).tolist() == [False, True, True, True]
+
+
+def scored(share: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return scores of positives, and of negatives of which a share score as high."""
+    other = -torch.ones(32_768)  # as many as are remembered
+    other[: round(share * len(other))] = 1
+    return torch.ones(4096), other
+
+
+def test_removal_does_not_feed_itself():
+    negatives = NegativeInstructions(POOL, "estimated", warmup=0.5)
+    negatives.progress = 0.4
+    negatives.watch(*scored(1 / 4))
+    negatives.progress = 0.6
+    negatives.watch(*scored(1 / 8))  # before anything is dropped it may fall and rise
+    negatives.watch(*scored(1 / 16))
+    assert negatives.keep(torch.rand(1024)).sum() == 960
+    negatives.watch(*scored(1 / 4))  # what is dropped scores higher: that is no evidence
+    assert negatives.keep(torch.rand(1024)).sum() == 960
+    negatives.watch(*scored(1 / 32))  # once begun it goes on, though there are fewer than 5%
+    assert negatives.keep(torch.rand(1024)).sum() == 992
+    assert negatives.suitable_share() == 1 / 32
+
+
+def test_where_few_are_suitable_after_the_warm_up_none_are_removed_for_good():
+    negatives = NegativeInstructions(POOL, "estimated", warmup=0.5)
+    negatives.progress = 0.6
+    negatives.watch(*scored(1 / 32))
+    assert negatives.keep(torch.rand(1024)).all()
+    negatives.watch(*scored(1 / 16))
+    assert negatives.keep(torch.rand(1024)).all()
+    assert negatives.suitable_share() == 1 / 16
+
+
+def test_the_bound_of_removal_travels_with_the_state_and_no_look_moves_it():
+    negatives, other = (NegativeInstructions(POOL, "estimated", warmup=0.5) for _ in range(2))
+    negatives.watch(*scored(1 / 8))
+    assert negatives.eval().keep(torch.rand(1024)).sum() == 896
+    assert float(negatives.bound) == 1
+    negatives.train().keep(torch.rand(1024))
+    other.load_state_dict(negatives.state_dict())
+    other.watch(*scored(1 / 4))
+    assert other.removal_rate == 1 / 8
+
+
+def test_a_share_that_is_given_cannot_be_asked_for():
+    with pytest.raises(UserError, match="removal_rate='estimated'"):
+        NegativeInstructions(POOL, 0.3).suitable_share()
 
 
 def test_an_untrained_classifier_does_not_remove_nearly_all():

@@ -16,7 +16,6 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import (
     ESTIMATED,
-    MOST_REMOVED,
     NegativeInstructions,
     masked_mean,
     pair_scores,
@@ -124,12 +123,8 @@ class InstructionLoss(SupervisedLoss):
         Raises:
             UserError: where the share is unknown, for the removal rate was given.
         """
-        estimate = self.negatives.estimate
-        if estimate is None:
-            raise UserError("calibrate needs removal_rate='estimated'")
         self.negatives.heed()  # what a checkpoint brought back
-        least = 1 / len(self.negatives.pool)
-        share = min(max(estimate.share(), least), MOST_REMOVED)
+        share = max(self.negatives.suitable_share(), 1 / len(self.negatives.pool))
         kept = self.unlabelled == "removal" and not self.negatives.share
         mixed = kept or self.unlabelled == "mixture"
         self.network.module.expect(share, mixed)

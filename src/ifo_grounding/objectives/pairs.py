@@ -27,7 +27,9 @@ class NegativeInstructions(nn.Module):
     A random other instruction may suit a scene just as well. So after a warm-up the share
     ``removal_rate`` of a batch's negatives that the classifier likes best is dropped (Bahdanau et
     al. 2019, whom the paper cites). The share can be estimated from the scores of positives and
-    negatives (:func:`~ifo_grounding.objectives.mixture.best_bin_estimate`).
+    negatives (:func:`~ifo_grounding.objectives.mixture.best_bin_estimate`). Whether any
+    are dropped is settled after the warm-up. From then on the estimate may fall but not rise: what
+    is dropped is no longer held down, scores higher, and would make it rise further and further.
 
     Args:
         pool: token ids [P, L]; repeated rows count once.
@@ -49,6 +51,8 @@ class NegativeInstructions(nn.Module):
     """
 
     pool: Tensor
+    bound: Tensor
+    """The largest share that may still be dropped; 1 until the warm-up is over."""
 
     def __init__(
         self,
@@ -72,6 +76,7 @@ class NegativeInstructions(nn.Module):
         if len(distinct) < 2:
             raise UserError("pool holds fewer than two different instructions: no negatives exist")
         self.register_buffer("pool", distinct, persistent=False)
+        self.register_buffer("bound", torch.ones(()))
         self.removal_rate = 0.0 if estimated else float(removal_rate)
         self.estimate = MixtureEstimate() if estimated else None
         self.warmup, self.near = warmup, near
@@ -120,8 +125,21 @@ class NegativeInstructions(nn.Module):
     def heed(self) -> None:
         """Remove the share that is estimated by now, where it is estimated."""
         if self.estimate is not None:
-            share = min(self.estimate.share(), MOST_REMOVED)
-            self.removal_rate = share if share >= LEAST_REMOVED else 0.0
+            share = self.suitable_share()
+            undecided = float(self.bound) == 1
+            self.removal_rate = 0.0 if undecided and share < LEAST_REMOVED else share
+            self.removal_rate = min(self.removal_rate, float(self.bound))
+
+    def suitable_share(self) -> float:
+        """Return the share of suitable ones as it is estimated by now, at most ``MOST_REMOVED``.
+
+        Raises:
+            UserError: where it is not estimated.
+        """
+        if self.estimate is None:
+            raise UserError("the share of suitable pairs needs removal_rate='estimated'")
+        bound = float(self.bound) or 1.0  # none are dropped, and the estimate is free to move
+        return min(self.estimate.share(), MOST_REMOVED, bound)
 
     @property
     def share(self) -> float:
@@ -131,6 +149,8 @@ class NegativeInstructions(nn.Module):
     def keep(self, scores: Tensor) -> Tensor:
         """Return a mask of ``scores`` [*] without the top share that is likely suitable."""
         drop = int(self.share * scores.numel())
+        if self.training and self.estimate is not None and self.progress >= self.warmup:
+            self.bound.clamp_(max=self.share)
         mask = torch.ones(scores.numel(), dtype=torch.bool, device=scores.device)
         mask[scores.detach().flatten().topk(drop).indices] = False
         return mask.reshape(scores.shape)
