@@ -15,8 +15,8 @@ from ifo_grounding.training import (
     Adversary,
     Rehearsal,
     SelfExaminationConfig,
+    policy_gradient,
     select_pairs,
-    self_examination,
     self_examine,
 )
 from ifo_grounding.training.environment import summary
@@ -130,7 +130,7 @@ def test_divergence_from_phase_1_costs_reward():
 def test_values_of_some_worlds_at_a_time_are_those_of_all_at_once(monkeypatch):
     learned = []
     for steps in (8, 40, 10_000):  # one world, five, all sixteen
-        monkeypatch.setattr(self_examination, "AT_ONCE", steps)
+        monkeypatch.setattr(policy_gradient, "AT_ONCE", steps)
         nets = make_networks()
         self_examine(make_env(), *nets, config(gamma=0.9), seed=0)
         learned.append([p.detach() for net in nets for p in net.parameters()])

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
-from torchrl.objectives.value import GAE
 
-from ifo_grounding import keys
 from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import derive
@@ -24,21 +16,19 @@ from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
 from ifo_grounding.training.environment import (
     check_env,
-    make_collector,
     reseed,
     sampler_stats,
     summary,
     transforms_of,
 )
 from ifo_grounding.training.guard import Guard
+from ifo_grounding.training.policy_gradient import Learner
 from ifo_grounding.training.rehearsal import Rehearsal
 from ifo_grounding.training.selection import Selection, SelectionSchedule
-from ifo_grounding.training.supervised import Callback, Log, Metrics, make_optimizer, update
+from ifo_grounding.training.supervised import Callback, Log, Metrics
 
 ALGORITHMS = ("ppo", "reinforce")
 NAME = "self-examination"
-AT_ONCE = 2048
-"""Steps whose values are estimated at once: as fast as all of them, in a fraction of the memory."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +153,7 @@ def self_examine(
         )
     policy.eval()
     value.eval()
-    learner = _Learner(env, policy, value, config, rehearsal)
+    learner = Learner(env, policy, value, config, rehearsal)
     sampler_stats(env)  # forgets the reset that a collector begins with
     selection = Selection(env, policy, config.selection, seed, guard, by_agreement)
     parts: dict[str, Any] = {
@@ -219,123 +209,3 @@ def self_examine(
             bar.update()
     learner.close()
     return history
-
-
-class _Learner:
-    """Holds the losses, the optimizer and the collector of one run."""
-
-    def __init__(
-        self,
-        env: EnvBase,
-        policy: ProbabilisticTensorDictSequential,
-        value: TensorDictModuleBase,
-        config: SelfExaminationConfig,
-        rehearsal: Rehearsal | None = None,
-    ) -> None:
-        self.config, self.policy, self.rehearsal = config, policy, rehearsal
-        self.value = value
-        self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl else None
-        self.collector = make_collector(env, policy, config.steps)
-        self.batches: Iterator[TensorDictBase] | None = None
-        self.advantage = GAE(
-            gamma=config.gamma, lmbda=config.lmbda, value_network=value, deactivate_vmap=True
-        )
-        self.advantage.set_keys(reward=keys.LEARNED_REWARD)
-        self.loss = _make_loss(policy, value, config)
-        critic = {id(p) for p in value.parameters()}
-        self.optimizer = make_optimizer(
-            (p for p in policy.parameters() if id(p) not in critic), 1.0
-        )
-        self.optimizer.param_groups[0]["lr"] = config.lr
-        self.optimizer.add_param_group({"params": list(value.parameters()), "lr": config.value_lr})
-
-    def collect(self) -> TensorDictBase:
-        """Roll out the policy from a reset, [N, T], without whatever the simulator judged."""
-        if self.batches is None:
-            self.batches = iter(self.collector)
-        batch = next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
-        if self.reference is not None:
-            self._charge_divergence(batch)
-        return batch
-
-    @torch.no_grad()
-    def _charge_divergence(self, batch: TensorDictBase) -> None:
-        steps = batch.reshape(-1)
-        parts = steps.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION).split(4096)
-        assert self.reference is not None
-        reference = torch.cat([_log_prob(self.reference, part) for part in parts])
-        current = torch.cat([_log_prob(self.policy, part) for part in parts])
-        charge = self.config.kl * (current - reference).reshape(*batch.shape, 1)
-        reward = batch[keys.NEXT, keys.LEARNED_REWARD]
-        batch[keys.NEXT, keys.LEARNED_REWARD] = reward - charge
-
-    def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
-        """Update policy and value on collected steps."""
-        config = self.config
-        self._estimate_advantages(batch)
-        scale = 1 - iteration / config.iterations if config.anneal else 1.0
-        trained = iteration >= config.value_warmup
-        self.optimizer.param_groups[0]["lr"] = scale * config.lr if trained else 0.0
-        self.optimizer.param_groups[1]["lr"] = scale * config.value_lr
-        # What comes next is in the advantage already; copying its images would cost a tenth.
-        steps = batch.exclude(keys.NEXT, keys.INITIAL_PIXELS).reshape(-1)
-        epochs = config.epochs if config.algorithm == "ppo" else 1
-        sums: dict[str, Tensor] = {}
-        updates = 0
-        for _ in range(epochs):
-            for rows in torch.randperm(len(steps)).split(config.minibatch):
-                losses = self.loss(steps[rows])
-                if self.rehearsal:
-                    losses["loss_rehearsal"] = self.rehearsal()
-                for key, scalar in update(losses, self.optimizer, config.grad_clip).items():
-                    sums[key] = sums.get(key, torch.zeros(())) + scalar.cpu()
-                updates += 1
-        return {key: float(total) / updates for key, total in sums.items()}
-
-    @torch.no_grad()
-    def _estimate_advantages(self, batch: TensorDictBase) -> None:
-        """Write advantages and value targets of steps [N, T], some worlds at a time."""
-        parts = batch.split(max(1, AT_ONCE // batch.shape[-1]))
-        estimate = self.advantage if self.config.gamma else self._undiscounted
-        found = self.advantage.out_keys
-        batch.update(torch.cat([estimate(part).select(*found) for part in parts]))
-
-    def _undiscounted(self, part: TensorDictBase) -> TensorDictBase:
-        """Do what the estimator does where only a step's own reward counts, for half the price.
-
-        It would estimate the value of the next state all the same, and multiply it by 0.
-        """
-        names = self.advantage.tensor_keys
-        value = self.value(part.select(*self.value.in_keys))[names.value]
-        reward = part[keys.NEXT, keys.LEARNED_REWARD]
-        found = {names.advantage: reward - value, names.value_target: reward, names.value: value}
-        return TensorDict(found, part.batch_size)
-
-    def close(self) -> None:
-        """Let go of the collector, and leave the env open for its owner."""
-        self.collector.shutdown(close_env=False)
-
-
-def _make_loss(
-    policy: ProbabilisticTensorDictSequential,
-    value: TensorDictModuleBase,
-    config: SelfExaminationConfig,
-) -> LossModule:
-    loss: LossModule
-    if config.algorithm == "ppo":
-        loss = ClipPPOLoss(
-            policy,
-            value,
-            clip_epsilon=config.clip,
-            entropy_bonus=config.entropy > 0,
-            entropy_coeff=config.entropy,
-            normalize_advantage=True,
-        )
-    else:
-        loss = ReinforceLoss(policy, value)
-    loss.set_keys(reward=keys.LEARNED_REWARD)
-    return loss
-
-
-def _log_prob(policy: ProbabilisticTensorDictSequential, steps: TensorDictBase) -> Tensor:
-    return policy.get_dist(steps.copy()).log_prob(steps[keys.ACTION])
