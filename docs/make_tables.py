@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+
 from ifo_grounding.evaluation.endings import ENDINGS, SHARED
 from ifo_grounding.files import atomic_write
 from ifo_grounding.report import markdown_table
@@ -29,8 +31,16 @@ PARTS = ROOT / "results" / "zero-shot"
 RECOMBINED = ROOT / "results" / "recombined"
 ABLATIONS = ROOT / "results" / "ablations"
 PRESETS = ("paper", "film", "strong")
+PHASES = ("phase-1", "pairs-5000", "pairs-10000")
+ZERO_SHOT_PHASES = ("zero-shot", "zero-shot-pairs-5000")
 ERRORS, FAILURES = REASONS[1:], ENDINGS[1:]
 NOT_RUN = "not run"
+EARLIER = "†"
+EARLIER_NOTE = f"{EARLIER} made with other options than `reproduce` has today; its file names them."
+PRESET_OPTIONS = OmegaConf.to_container(
+    OmegaConf.load(ROOT / "recipes" / "conf" / "reproduce.yaml").options_of.preset
+)
+"""What `reproduce` says to each preset today."""
 
 Pieces = dict[Any, list[dict[str, Any]]]
 
@@ -46,11 +56,31 @@ def success(runs: list[dict[str, Any]] | None, name: str) -> str:
     """Return a policy's success over its seeds and, of phase 2, the paired gain."""
     if not runs:
         return NOT_RUN
-    rate = brief(two_level_bootstrap(outcomes(runs, name)))
+    rate = f"{brief(two_level_bootstrap(outcomes(runs, name)))}{mark(runs)}"
     if name == "phase1":
         return rate
     gain = paired_difference(outcomes(runs, "phase1"), outcomes(runs, name))
     return f"{rate}<br>{brief(gain)} points"
+
+
+def mark(runs: list[dict[str, Any]]) -> str:
+    """Return the mark of results that were made with other options than today's, if they were."""
+    return EARLIER if any(not is_of_today(run["options"]) for run in runs) else ""
+
+
+def is_of_today(options: dict[str, Any]) -> bool:
+    """Whether options of a piece are those that `reproduce` says to its preset today."""
+    return all(
+        options[section].get(name) == value
+        for section, values in PRESET_OPTIONS[options["network"]].items()
+        for name, value in values.items()
+    )
+
+
+def noted(*parts: str) -> str:
+    """Return parts of a page, with what the mark means where it occurs."""
+    text = "\n\n".join(part for part in parts if part)
+    return f"{text}\n\n{EARLIER_NOTE}" if EARLIER in text else text
 
 
 def mean(shares: list[float], digits: int = 2) -> str:
@@ -101,7 +131,7 @@ def suitability_rows(found: Pieces) -> list[dict[str, str]]:
             row = {"task": "", "by": f"`{preset}`"}
             for name, title in heads.items():
                 values = [brief(restored(Rate, r["results"]["suitability"][name])) for r in runs]
-                row[title] = "<br>".join(values) or NOT_RUN
+                row[title] = "<br>".join(values) + mark(runs) or NOT_RUN
             rows.append(row)
     return rows
 
@@ -150,16 +180,16 @@ def content() -> str:
     )
     parts = [
         "## Table 2: success",
-        table(success_rows(found, TABLE_2, ("phase-1", "pairs-5000", "pairs-10000"), phases)),
+        noted(table(success_rows(found, TABLE_2, PHASES, phases))),
         "## Table 3: suitable instructions",
         "Of the instructions chosen for 20,000 fresh states, the share that is suitable, and the"
         " share of states that got one. `at most` is the share of states that any instruction of"
         " the demonstrations suits, by the oracle.",
-        table(suitability_rows(found)),
+        noted(table(suitability_rows(found))),
         "## Table 4: zero-shot",
         "Instructions that mention at least one of three colour-shape pairs which no instruction of"
         " the demonstrations mentions.",
-        table(success_rows(found, TABLE_4, ("zero-shot", "zero-shot-pairs-5000"), phases[:2])),
+        noted(table(success_rows(found, TABLE_4, ZERO_SHOT_PHASES, phases[:2]))),
         "## Figure 5: what is wrong with unsuitable choices",
         table(counted(found, "phase-1", ERRORS, lambda results: results["suitability"]["errors"])),
         "## Figure 6: what phase 2 changes",
@@ -271,8 +301,8 @@ def readme_tables() -> str:
             rows[-1][f"`{preset}`, 1"] = success(first, "phase1")
             rows[-1][f"`{preset}`, 2"] = success(practised, "phase2").split("<br>")[0]
             chosen = [run["results"]["suitability"]["rate"]["rate"] for run in first or []]
-            suitable[-1][f"`{preset}`"] = mean(chosen, 1) if chosen else NOT_RUN
-    return f"{table(rows)}\n\nSuitable instructions among those chosen:\n\n{table(suitable)}"
+            suitable[-1][f"`{preset}`"] = mean(chosen, 1) + mark(first) if first else NOT_RUN
+    return noted(table(rows), "Suitable instructions among those chosen:", table(suitable))
 
 
 def readme_zero_shot() -> str:
