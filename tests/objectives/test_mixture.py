@@ -70,6 +70,17 @@ def test_removal_does_not_feed_itself():
     negatives.watch(*scored(1 / 32))  # once begun it goes on, though there are fewer than 5%
     assert negatives.keep(torch.rand(1024)).sum() == 992
     assert negatives.suitable_share() == 1 / 32
+    negatives.watch(*scored(1 / 4))
+    assert negatives.keep(torch.rand(1024)).sum() == 960
+
+
+def test_scores_of_both_kinds_reach_back_as_far():
+    negatives = NegativeInstructions(POOL, "estimated")
+    rows = torch.arange(4096, dtype=torch.float32)
+    for batch in rows.split(128):
+        negatives.watch(batch, batch.unsqueeze(1).expand(-1, 32))
+    assert torch.equal(negatives.estimate.positive, rows)
+    assert torch.equal(negatives.estimate.unlabelled, rows.repeat_interleave(8))
 
 
 def test_where_few_are_suitable_after_the_warm_up_none_are_removed_for_good():

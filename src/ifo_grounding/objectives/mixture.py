@@ -59,6 +59,7 @@ class MixtureEstimate(nn.Module):
 
     def __init__(self, size: int = 4096, ratio: int = 8) -> None:
         super().__init__()
+        self.ratio = ratio
         self.register_buffer("positive", torch.zeros(size))
         self.register_buffer("unlabelled", torch.zeros(size * ratio))
         self.register_buffer("count", torch.zeros(2, dtype=torch.int64))

@@ -28,8 +28,8 @@ class NegativeInstructions(nn.Module):
     ``removal_rate`` of a batch's negatives that the classifier likes best is dropped (Bahdanau et
     al. 2019, whom the paper cites). The share can be estimated from the scores of positives and
     negatives (:func:`~ifo_grounding.objectives.mixture.best_bin_estimate`). Whether any
-    are dropped is settled after the warm-up. From then on the estimate may fall but not rise: what
-    is dropped is no longer held down, scores higher, and would make it rise further and further.
+    are dropped, and how many at most, is settled when the warm-up ends: what is dropped is no
+    longer held down, scores higher, and would make the estimate rise further and further.
 
     Args:
         pool: token ids [P, L]; repeated rows count once.
@@ -117,18 +117,23 @@ class NegativeInstructions(nn.Module):
         return self.pool[nearest.gather(1, chosen)]
 
     def watch(self, own: Tensor, other: Tensor) -> None:
-        """Learn the share of suitable ones from scores of positives [N] and negatives [*, K]."""
+        """Learn the share of suitable ones from scores of positives [N] and negatives [*, K].
+
+        Of the negatives no more are remembered than reach back as far as the positives: scores grow
+        while a classifier learns, and later ones of one kind would pass for better ones.
+        """
         if self.estimate is not None:
-            self.estimate.add(own, other[..., : self.uniform(other.shape[-1])])
+            count = other.shape[-1]
+            as_far = self.estimate.ratio * own.numel() * count // max(other.numel(), 1)
+            self.estimate.add(own, other[..., : min(self.uniform(count), max(as_far, 1))])
             self.heed()
 
     def heed(self) -> None:
         """Remove the share that is estimated by now, where it is estimated."""
         if self.estimate is not None:
             share = self.suitable_share()
-            undecided = float(self.bound) == 1
-            self.removal_rate = 0.0 if undecided and share < LEAST_REMOVED else share
-            self.removal_rate = min(self.removal_rate, float(self.bound))
+            few = self.undecided and share < LEAST_REMOVED
+            self.removal_rate = 0.0 if few else min(share, float(self.bound))
 
     def suitable_share(self) -> float:
         """Return the share of suitable ones as it is estimated by now, at most ``MOST_REMOVED``.
@@ -142,6 +147,11 @@ class NegativeInstructions(nn.Module):
         return min(self.estimate.share(), MOST_REMOVED, bound)
 
     @property
+    def undecided(self) -> bool:
+        """Whether it is still open if any are dropped, and how many at most."""
+        return float(self.bound) == 1
+
+    @property
     def share(self) -> float:
         """Share of suitable negatives, as far as it is to be heeded by now."""
         return self.removal_rate if self.progress >= self.warmup else 0.0
@@ -149,8 +159,9 @@ class NegativeInstructions(nn.Module):
     def keep(self, scores: Tensor) -> Tensor:
         """Return a mask of ``scores`` [*] without the top share that is likely suitable."""
         drop = int(self.share * scores.numel())
-        if self.training and self.estimate is not None and self.progress >= self.warmup:
-            self.bound.clamp_(max=self.share)
+        over = self.progress >= self.warmup
+        if self.training and over and self.estimate is not None and self.undecided:
+            self.bound.fill_(self.share)
         mask = torch.ones(scores.numel(), dtype=torch.bool, device=scores.device)
         mask[scores.detach().flatten().topk(drop).indices] = False
         return mask.reshape(scores.shape)
