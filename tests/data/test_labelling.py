@@ -17,6 +17,7 @@ from ifo_grounding.data import (
     record_demonstrations,
 )
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks import make_inverse
 from ifo_grounding.tasks import TASKS
 
 
@@ -53,6 +54,42 @@ def test_labels_are_what_the_expert_did(task, inverse):
     assert torch.equal(report.counts, truth.actions.long().bincount(minlength=6))
     assert report.counts[5] == 60
     assert len(buffer) == demos.transitions
+
+
+@pytest.mark.parametrize("task", ["move", "pick-out"])
+@pytest.mark.parametrize("preset", ["film", "strong"])
+def test_labels_read_from_tiles_are_those_read_from_pixels(task, preset, monkeypatch):
+    demos = record_demonstrations(task, 40)
+    model = make_inverse(demos, preset, seed=0)
+    network = type(model.module)
+    read = []
+    from_tiles = network.from_tiles
+    monkeypatch.setattr(
+        network, "from_tiles", lambda self, *tiles: read.append(1) or from_tiles(self, *tiles)
+    )
+    report = label_demonstrations(demos, model, batch_size=100, progress=False).report
+    assert len(read) == -(-demos.transitions // 100)
+    monkeypatch.setattr(network, "reads_tiles", lambda self, *sizes: False)
+    plain = label_demonstrations(demos, model, batch_size=100, progress=False).report
+    assert len(report.actions.unique()) > 1
+    assert torch.equal(report.actions, plain.actions)
+    torch.testing.assert_close(report.confidence, plain.confidence)
+
+
+@pytest.mark.parametrize(("preset", "tile_size"), [("paper", 8), ("strong", 16), ("strong", None)])
+def test_pixels_are_read_where_tiles_are_no_patches(preset, tile_size, monkeypatch):
+    demos = record_demonstrations("move", 20)
+    codec = FrameCodec.fit(demos.frames(torch.arange(demos.n_frames)), tile_size or 8)
+    if tile_size is None:
+        codec = FrameCodec(demos.image_shape)
+    codes = codec.encode(demos.frames(torch.arange(demos.n_frames)))
+    again = Demonstrations(
+        codec, codes, demos.lengths, demos.instructions, vocabulary=demos.vocabulary
+    )
+    model = make_inverse(demos, preset, seed=0)
+    monkeypatch.delattr(type(model.module), "from_tiles")
+    report = label_demonstrations(again, model, progress=False).report
+    assert len(report.actions) == demos.transitions
 
 
 def test_samples_are_the_demonstrations_own_transitions(inverse):

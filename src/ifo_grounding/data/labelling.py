@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDict
@@ -112,7 +112,9 @@ def label_demonstrations(
 ) -> Labelled:
     """Label every transition of demonstrations with an inverse model (paper, "Labelling").
 
-    The model runs in eval mode without gradients; its mode is then what it was.
+    The model runs in eval mode without gradients; its mode is then what it was. One of
+    :func:`~ifo_grounding.networks.make_inverse` whose patches are the codec's tiles is shown these,
+    with the same result: no picture is put together.
 
     Args:
         demos: demonstrations.
@@ -212,6 +214,10 @@ def _logits(
     device: torch.device,
     logits_key: NestedKey,
 ) -> Tensor:
+    reads_tiles = getattr(getattr(inverse, "module", None), "reads_tiles", None)
+    if reads_tiles is not None and reads_tiles(demos.image_shape, demos.tile_size):
+        parts = (demos.codec.tiles, demos.codes[frame], demos.codes[frame + 1])
+        return inverse.module.from_tiles(*(cast(Tensor, part).to(device) for part in parts))
     pair = TensorDict(
         {
             keys.PIXELS: demos.frames(frame).to(device),

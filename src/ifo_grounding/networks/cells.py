@@ -140,8 +140,29 @@ def pair_up(cells: Tensor, instructions: Tensor, n_cells: int, n_instructions: i
     >>> pairs.cell.tolist(), pairs.instruction.tolist(), pairs.index.tolist()
     ([0, 1], [2, 2], [[0, 1, 0], [1, 1, 0]])
     """
-    keys = cells + (instructions * n_cells).unsqueeze(1)
-    size = n_cells * n_instructions
+    return Pairs(*distinct_pairs(cells, instructions.unsqueeze(1), n_cells, n_instructions))
+
+
+def distinct_pairs(
+    first: Tensor, second: Tensor, n_first: int, n_second: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Find the distinct pairs of two numbers.
+
+    Args:
+        first: numbers below ``n_first``, int64 [*B].
+        second: numbers below ``n_second``, int64, broadcast to [*B].
+        n_first: bound of the first.
+        n_second: bound of the second.
+
+    Returns:
+        The first and the second number of each distinct pair, int64 [P] each, and which pair lies
+        where, int64 [*B].
+
+    >>> [part.tolist() for part in distinct_pairs(torch.tensor([3, 1, 3]), torch.tensor(2), 4, 3)]
+    [[1, 3], [2, 2], [1, 0, 1]]
+    """
+    keys = first + second * n_first
+    size = n_first * n_second
     if size <= ROOM:
         mark = keys.new_zeros(size)
         mark[keys.flatten()] = 1
@@ -150,7 +171,7 @@ def pair_up(cells: Tensor, instructions: Tensor, n_cells: int, n_instructions: i
         index = mark[keys]
     else:
         found, index = torch.unique(keys, return_inverse=True)
-    return Pairs(found % n_cells, found // n_cells, index)
+    return found % n_first, found // n_first, index
 
 
 def look_up(table: Tensor, index: Tensor) -> Tensor:

@@ -14,9 +14,11 @@ from torch import Tensor, nn
 
 from ifo_grounding import keys
 from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
+from ifo_grounding.networks.cells import Cells, distinct_pairs
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import PatchEncoder
 from ifo_grounding.networks.fusion import ResidualBlock, pool_cells
+from ifo_grounding.networks.patches import as_float
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.trunk import (
     Network,
@@ -51,10 +53,40 @@ class InverseNetwork(Network):
         after, next_batch = self.flat_pixels(next_pixels)
         same_batch(pixels=batch, next_pixels=next_batch)
         with self.autocast(pixels):
-            features = F.relu(self._encoded(torch.cat([before, after], -3)))
-            features = F.relu(self.blocks(features))
-            outputs = self.head(flatten_cells(features) if self.paper else pool_cells(features))
+            outputs = self._judged(self._encoded(torch.cat([before, after], -3)))
         return outputs.float().reshape(*batch, outputs.shape[-1])
+
+    def reads_tiles(self, image_shape: tuple[int, ...], tile_size: int | None) -> bool:
+        """Whether :meth:`from_tiles` takes images of this shape made of tiles of this size."""
+        if not isinstance(self.image, PatchEncoder) or image_shape != self.shapes.image_shape:
+            return False
+        return self.image.patch == tile_size
+
+    def from_tiles(self, tiles: Tensor, before: Tensor, after: Tensor) -> Tensor:
+        """Compute what :meth:`forward` does of the pictures that tiles make, without making them.
+
+        Args:
+            tiles: distinct tiles as large as this network's patches, uint8 [K, C, T, T].
+            before: which tile lies where in the images before, integer [N, h, w].
+            after: the same of the images after.
+
+        Returns:
+            Logits, float32 [N, A].
+        """
+        assert isinstance(self.image, PatchEncoder)
+        height, width = before.shape[1:]
+        codes = before.flatten(1).long(), after.flatten(1).long()
+        first, second, index = distinct_pairs(*codes, len(tiles), len(tiles))
+        seen = torch.cat([tiles[first], tiles[second]], 1).flatten(2)
+        with self.autocast(tiles):
+            features = self.image.embed(as_float(_with_change(seen).flatten(1)))
+            outputs = self._judged(Cells(features, index).maps(height, width))
+        return outputs.float()
+
+    def _judged(self, encoded: Tensor) -> Tensor:
+        """Map encoded images [N, F, h, w] to logits [N, A]."""
+        features = F.relu(self.blocks(F.relu(encoded)))
+        return self.head(flatten_cells(features) if self.paper else pool_cells(features))
 
     def _encoded(self, both: Tensor) -> Tensor:
         """Encode two images on top of each other, [N, 2 C, H, W], to [N, F, h, w]."""
