@@ -144,9 +144,11 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
             },
         },
     }
-    for phase, found in results.items():
+    today = script.PRESET_OPTIONS["strong"]
+    earlier = {**today, "imitate": {**today["imitate"], "steps": 1}}
+    for (phase, found), said in zip(results.items(), (today, earlier), strict=True):
         piece = {
-            "options": {"task": "pick", "network": "strong", "variant": phase},
+            "options": {"task": "pick", "network": "strong", "variant": phase, **said},
             "results": found,
             "command": f"ifo-grounding run study variant={phase}",
             "provenance": {"commit": "abc", "machine": "a machine"},
@@ -167,3 +169,7 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
         "13.0% [10.3,\u00a016.2]",
     ):
         assert shown in text
+    [row] = [line for line in text.splitlines() if "| `strong` | 1 | 50.0%" in line]
+    first, second = row.split(" | ")[3:5]
+    assert "†" not in first and "]†<br>" in second
+    assert text.count("† made with other options than `reproduce` has today") == 1
