@@ -49,9 +49,16 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
     release_freed_memory()  # of the stage before
     common = ["task", "seed", "network", "world"]
     decisive = {key: plain(options[key]) for key in [*common, *sections]}
+    if changed := changed_networks(options):
+        decisive["networks"] = changed  # only then: runs without any go on as they were
     stage = open_run(options).stage(name, decisive, needs)
     print(f"{name}: {'done before' if stage.result is not None else 'running'}", flush=True)
     return stage
+
+
+def changed_networks(options: DictConfig) -> dict[str, Any]:
+    """Return which values of the networks the options replace."""
+    return {name: value for name, value in options.networks.items() if value is not None}
 
 
 def shows_progress(options: DictConfig) -> bool:

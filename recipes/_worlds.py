@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from _shared import load_demonstrations, open_run, plain
+from _shared import changed_networks, load_demonstrations, open_run, plain
 from omegaconf import DictConfig
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -159,5 +159,5 @@ def context_of(options: DictConfig, section: str) -> int:
 
 def build(make: Callable[..., Any], options: DictConfig, **kwargs: Any) -> Any:
     """Build a network for the simulator's images, words and actions."""
-    chosen = {"seed": options.seed, "device": options.device, **kwargs}
+    chosen = {"seed": options.seed, "device": options.device, **changed_networks(options), **kwargs}
     return make(open_world(options).simulator(), options.network, **chosen)

@@ -115,6 +115,25 @@ def test_a_changed_option_redoes_what_depends_on_it(compose, tmp_path):
     assert any(not torch.equal(weight, second[name]) for name, weight in first.items())
 
 
+def test_options_replace_values_of_every_network(compose, tmp_path):
+    from record_demonstrations import record
+    from train_inverse import train_inverse
+    from collect_transitions import collect  # isort: skip
+
+    def features(*options):
+        given = compose("train_inverse", *options)
+        for stage in (record, collect, train_inverse):
+            stage(given)
+        inverse = networks.load(tmp_path / "run" / "inverse.safetensors")
+        return inverse.network_config.config.features
+
+    assert features() == 32
+    assert features("networks.features=16") == 16
+    assert features() == 32
+    with pytest.raises(UserError, match="preset 'paper' alone"):
+        features("networks.sentence_rate=0.5")
+
+
 def test_a_stage_without_what_it_needs_says_what_to_run(compose):
     from imitate import imitate
 
