@@ -71,7 +71,7 @@ def mark(runs: list[dict[str, Any]]) -> str:
 def is_of_today(options: dict[str, Any]) -> bool:
     """Whether options of a piece are those that `reproduce` says to its preset today."""
     return all(
-        options[section].get(name) == value
+        options.get(section, {}).get(name) == value
         for section, values in PRESET_OPTIONS[options["network"]].items()
         for name, value in values.items()
     )
