@@ -62,7 +62,13 @@ def lines(row: dict[str, Any]) -> list[dict[str, str]]:
 
 
 def times(ratio: dict[str, float]) -> str:
-    return f"{ratio['median']:.3g}x [{ratio['low']:.3g}, {ratio['high']:.3g}]"
+    median, low, high = (three_digits(ratio[name]) for name in ("median", "low", "high"))
+    return f"{median}x [{low}, {high}]"
+
+
+def three_digits(value: float) -> str:
+    """Return a number with three digits that count, or all before the point."""
+    return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
 
 
 def short(value: float) -> str:
