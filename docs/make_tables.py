@@ -6,6 +6,7 @@ date.
 """
 
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,12 @@ RECOMBINED = ROOT / "results" / "recombined"
 ABLATIONS = ROOT / "results" / "ablations"
 PRESETS = ("paper", "film", "strong")
 PHASES = ("phase-1", "pairs-5000", "pairs-10000")
+GOAL = "goal-pairs-5000"
+"""Phase 2 of preset `paper`, paid for the goal instead of for actions."""
 ZERO_SHOT_PHASES = ("zero-shot", "zero-shot-pairs-5000")
 ERRORS, FAILURES = REASONS[1:], ENDINGS[1:]
 NOT_RUN = "not run"
+PAID_FOR_GOALS = "paid for goals"
 EARLIER = "†"
 EARLIER_NOTE = f"{EARLIER} made with other options than `reproduce` has today; its file names them."
 PRESET_OPTIONS = OmegaConf.to_container(
@@ -98,7 +102,7 @@ def success_rows(
 ) -> list[dict[str, str]]:
     """Return the paper's rates and ours, one row each: of phase 1, then of phase 2.
 
-    A preset that was run on no task has no row.
+    A preset that was run on no task has no row. What is paid for goals has one where it was run.
     """
     rows = []
     ran = {preset for _, preset, phase in found if phase in phases}
@@ -115,6 +119,10 @@ def success_rows(
             seeds = " / ".join(map(str, counts if len(set(counts)) > 1 else counts[:1]))
             rows.append({"task": "", "by": f"`{preset}`", "seeds": seeds})
             rows[-1] |= dict(zip(heads, values, strict=True))
+            if "pairs-5000" in phases and (practised := found.get((task, preset, GOAL))):
+                values = ["as above", success(practised, "phase2")]
+                rows.append({"task": "", "by": f"`{preset}`, {PAID_FOR_GOALS}"})
+                rows[-1] |= {"seeds": str(len(practised)), **dict(zip(heads, values, strict=False))}
     return rows
 
 
@@ -142,14 +150,17 @@ def counted(
     names: tuple[str, ...],
     read: Callable[[dict[str, Any]], dict[str, int]],
 ) -> list[dict[str, str]]:
-    """Return rows of counts by name, added over seeds, of what was run."""
+    """Return rows of counts by name, added over seeds, of what was run.
+
+    Beside a phase 2 stands that which is paid for goals.
+    """
     rows = []
-    for task in TASKS:
-        for preset in PRESETS:
-            if runs := found.get((task, preset, phase)):
-                counts = [read(run["results"]) for run in runs]
-                added = {name: f"{sum(some.get(name, 0) for some in counts):,}" for name in names}
-                rows.append({"task": task, "preset": f"`{preset}`", **added})
+    also = [(GOAL, f", {PAID_FOR_GOALS}")] if phase == "pairs-5000" else []
+    for task, preset, (ran, said) in product(TASKS, PRESETS, [(phase, ""), *also]):
+        if runs := found.get((task, preset, ran)):
+            counts = [read(run["results"]) for run in runs]
+            added = {name: f"{sum(some.get(name, 0) for some in counts):,}" for name in names}
+            rows.append({"task": task, "preset": f"`{preset}`{said}", **added})
     return rows
 
 

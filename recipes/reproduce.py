@@ -26,14 +26,16 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json
 
 PHASES = ("phase-1", "pairs-5000", "pairs-10000")
+GOAL = "goal-pairs-5000"
+"""Phase 2 paid for the goal, of the preset whose own phase 2 is paid for actions."""
 ZERO_SHOT = ("zero-shot", "zero-shot-pairs-5000")
 UNSEEN = "zero-shot-unseen"
 WANTED = {
-    ("table", 2): PHASES,
+    ("table", 2): (*PHASES, GOAL),
     ("table", 3): PHASES[:1],
     ("table", 4): (*ZERO_SHOT, UNSEEN),
     ("figure", 5): PHASES[:1],
-    ("figure", 6): PHASES[:2],
+    ("figure", 6): (*PHASES[:2], GOAL),
 }
 """Pieces that each table and figure of the paper is made from; the first has phase 1."""
 RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
@@ -195,7 +197,7 @@ def wanted_phases(options: DictConfig) -> list[str]:
     for kind, number in asked:
         check_choice(kind, number, [of for which, of in WANTED if which == kind])
     needed = {phase for key in asked for phase in WANTED[key]}
-    return [phase for phase in (*PHASES, *ZERO_SHOT, UNSEEN) if phase in needed]
+    return [phase for phase in (*PHASES, GOAL, *ZERO_SHOT, UNSEEN) if phase in needed]
 
 
 def chain(
@@ -204,7 +206,9 @@ def chain(
     """Yield the pieces of one task, preset and seed, each phase 1 before what builds on it."""
     sections = options.options_of
     for phase in phases:
-        first = next(of[0] for of in (PHASES, ZERO_SHOT, (UNSEEN,)) if phase in of)
+        if phase == GOAL and preset != "paper":
+            continue  # paid for the goal as it is
+        first = next(of[0] for of in ((*PHASES, GOAL), ZERO_SHOT, (UNSEEN,)) if phase in of)
         names = {part: f"tables-{task}-{preset}-{part}-seed{seed}" for part in (phase, first)}
         given = {
             "task": task,
