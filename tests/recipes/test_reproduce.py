@@ -137,7 +137,9 @@ def test_listing_runs_nothing(options, capsys):
 
     assert reproduce(options("table=2", "list=true", "seeds=[0,1]")) == []
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 5 * 3 * 2 * 3
+    assert len(lines) == 5 * 2 * (3 + 3 + 4)
+    paid = [line.split("/")[-1] for line in lines if "goal-pairs-5000" in line]
+    assert len(paid) == 10 and all("-paper-" in name for name in paid)
     assert all(line.startswith("not run") for line in lines)
 
 
