@@ -129,10 +129,17 @@ class Both:
         return torch.cat([part.select(*entries) for part in parts])
 
 
+def run_controls(options: DictConfig) -> list[dict]:
+    """Make both controls, or without ``controls.clone`` the first."""
+    results = [continue_imitation(options)]
+    if options.controls.clone:
+        results.append(clone_accepted(options))
+    return results
+
+
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(continue_imitation(options))
-    print(clone_accepted(options))
+    print(*run_controls(options), sep="\n")
 
 
 if __name__ == "__main__":

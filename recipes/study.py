@@ -5,7 +5,7 @@ python recipes/study.py task=move budget=study demonstrations.n=1000 seed=0 resu
 
 from _results import keep_result, write_result
 from _shared import open_run
-from controls import clone_accepted, continue_imitation
+from controls import run_controls
 from evaluate import evaluate
 from omegaconf import DictConfig
 from references import references
@@ -21,8 +21,7 @@ def study(options: DictConfig) -> dict:
     train_phases(options)
     practised = options.phase2 and options.practise
     if practised and options.controls.run:
-        continue_imitation(options)
-        clone_accepted(options)
+        run_controls(options)
     results = evaluate(options)
     if options.references:
         results = {**results, **references(options)}
