@@ -311,6 +311,10 @@ def readme_tables() -> str:
             )
             rows[-1][f"`{preset}`, 1"] = success(first, "phase1")
             rows[-1][f"`{preset}`, 2"] = success(practised, "phase2").split("<br>")[0]
+            if preset == "paper":
+                rows[-1][f"2, {PAID_FOR_GOALS}"] = success(
+                    found.get((task, preset, GOAL)), "phase2"
+                )
             chosen = [run["results"]["suitability"]["rate"]["rate"] for run in first or []]
             suitable[-1][f"`{preset}`"] = mean(chosen, 1) + mark(first) if first else NOT_RUN
     return noted(table(rows), "Suitable instructions among those chosen:", table(suitable))
