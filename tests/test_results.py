@@ -146,15 +146,21 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
     }
     today = script.PRESET_OPTIONS["strong"]
     earlier = {**today, "imitate": {**today["imitate"], "steps": 1}}
-    for (phase, found), said in zip(results.items(), (today, earlier), strict=True):
+    of_paper = script.PRESET_OPTIONS["paper"]
+    for preset, phase, like, said in (
+        ("strong", "phase-1", "phase-1", today),
+        ("strong", "pairs-5000", "pairs-5000", earlier),
+        ("paper", "phase-1", "phase-1", of_paper),
+        ("paper", "goal-pairs-5000", "pairs-5000", of_paper),
+    ):
         piece = {
-            "options": {"task": "pick", "network": "strong", "variant": phase, **said},
-            "results": found,
+            "options": {"task": "pick", "network": preset, "variant": phase, **said},
+            "results": results[like],
             "command": f"ifo-grounding run study variant={phase}",
             "provenance": {"commit": "abc", "machine": "a machine"},
             "seconds": 600,
         }
-        write_json(folder / f"{phase}.json", piece)
+        write_json(folder / f"{preset}-{phase}.json", piece)
     monkeypatch.setattr(script, "ROOT", tmp_path)
     text = script.content()
     for shown in (
@@ -166,6 +172,8 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
         "| pick | `strong` | 15 | 0 | 0 | 5 | 0 | 0 |",
         "| phase 2 alone | pick | `strong` | 2 | 0 | 0 | 0 |",
         "| pick | `strong` | 1 | 3 |",
+        "|  | `paper`, paid for goals | 1 | as above | 75.0% [",
+        "| phase 2 alone | pick | `paper`, paid for goals | 2 | 0 | 0 | 0 |",
         "13.0% [10.3,\u00a016.2]",
     ):
         assert shown in text
