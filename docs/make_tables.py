@@ -39,6 +39,8 @@ ZERO_SHOT_PHASES = ("zero-shot", "zero-shot-pairs-5000")
 ERRORS, FAILURES = REASONS[1:], ENDINGS[1:]
 NOT_RUN = "not run"
 PAID_FOR_GOALS = "paid for goals"
+SHOWN_CHANGES = ("pairs-5000", GOAL)
+"""Pieces whose phase 2 Fig. 6 compares with phase 1."""
 EARLIER = "†"
 EARLIER_NOTE = f"{EARLIER} made with other options than `reproduce` has today; its file names them."
 PRESET_OPTIONS = OmegaConf.to_container(
@@ -97,12 +99,22 @@ def of_paper(percent: float) -> str:
     return brief(wilson(round(percent / 100 * EPISODES), EPISODES))
 
 
+def named(preset: str, phase: str) -> str:
+    """Return what a table calls a preset in a phase."""
+    return f"`{preset}`, {PAID_FOR_GOALS}" if phase == GOAL else f"`{preset}`"
+
+
 def success_rows(
-    found: Pieces, reported: dict[str, tuple[float, ...]], phases: tuple[str, ...], heads: list[str]
+    found: Pieces,
+    reported: dict[str, tuple[float, ...]],
+    phases: tuple[str, ...],
+    heads: list[str],
+    also: tuple[str, ...] = (),
 ) -> list[dict[str, str]]:
     """Return the paper's rates and ours, one row each: of phase 1, then of phase 2.
 
-    A preset that was run on no task has no row. What is paid for goals has one where it was run.
+    A preset that was run on no task has no row. Another way to practise has a row of its own where
+    it was run, with its phase 2 in the first column of phase 2.
     """
     rows = []
     ran = {preset for _, preset, phase in found if phase in phases}
@@ -117,12 +129,12 @@ def success_rows(
             values = [success(some, name) for some, name in zip(runs, shown, strict=True)]
             counts = [len(some) for some in runs if some]
             seeds = " / ".join(map(str, counts if len(set(counts)) > 1 else counts[:1]))
-            rows.append({"task": "", "by": f"`{preset}`", "seeds": seeds})
+            rows.append({"task": "", "by": named(preset, phases[0]), "seeds": seeds})
             rows[-1] |= dict(zip(heads, values, strict=True))
-            if "pairs-5000" in phases and (practised := found.get((task, preset, GOAL))):
-                values = ["as above", success(practised, "phase2")]
-                rows.append({"task": "", "by": f"`{preset}`, {PAID_FOR_GOALS}"})
-                rows[-1] |= {"seeds": str(len(practised)), **dict(zip(heads, values, strict=False))}
+            for phase in also:
+                if some := found.get((task, preset, phase)):
+                    row = {"task": "", "by": named(preset, phase), "seeds": str(len(some))}
+                    rows.append({**row, heads[0]: "as above", heads[1]: success(some, "phase2")})
     return rows
 
 
@@ -146,21 +158,17 @@ def suitability_rows(found: Pieces) -> list[dict[str, str]]:
 
 def counted(
     found: Pieces,
-    phase: str,
+    phases: tuple[str, ...],
     names: tuple[str, ...],
     read: Callable[[dict[str, Any]], dict[str, int]],
 ) -> list[dict[str, str]]:
-    """Return rows of counts by name, added over seeds, of what was run.
-
-    Beside a phase 2 stands that which is paid for goals.
-    """
+    """Return rows of counts by name, added over seeds, of what was run."""
     rows = []
-    also = [(GOAL, f", {PAID_FOR_GOALS}")] if phase == "pairs-5000" else []
-    for task, preset, (ran, said) in product(TASKS, PRESETS, [(phase, ""), *also]):
-        if runs := found.get((task, preset, ran)):
+    for task, preset, phase in product(TASKS, PRESETS, phases):
+        if runs := found.get((task, preset, phase)):
             counts = [read(run["results"]) for run in runs]
             added = {name: f"{sum(some.get(name, 0) for some in counts):,}" for name in names}
-            rows.append({"task": task, "preset": f"`{preset}`{said}", **added})
+            rows.append({"task": task, "preset": named(preset, phase), **added})
     return rows
 
 
@@ -169,7 +177,7 @@ def change_rows(found: Pieces) -> list[dict[str, str]]:
     rows = []
     for part, title in (("gained", "phase 2 alone"), ("lost", "phase 1 alone")):
         some = counted(
-            found, "pairs-5000", FAILURES, lambda results, part=part: results["changes"][part]
+            found, SHOWN_CHANGES, FAILURES, lambda results, part=part: results["changes"][part]
         )
         rows += [{"solved by": title, **row} for row in some]
     return sorted(rows, key=lambda row: TASKS.index(row["task"]))
@@ -185,13 +193,17 @@ def content() -> str:
     phases = ["phase 1", "phase 2, 5,000 pairs", "phase 2, 10,000 pairs"]
     path_rows = counted(
         found,
-        "pairs-5000",
+        SHOWN_CHANGES,
         ("other path", "same path"),
         lambda results: {name: results["changes"][name] for name in ("other path", "same path")},
     )
     parts = [
         "## Table 2: success",
-        noted(table(success_rows(found, TABLE_2, PHASES, phases))),
+        noted(table(success_rows(found, TABLE_2, PHASES, phases, also=(GOAL,)))),
+        f"{PAID_FOR_GOALS.capitalize()}: practice with the"
+        " [goal judge](phase2.md#the-goal-judge-an-extension), an extension. Imitation that goes on"
+        " for as long [gained as much or more](#where-a-number-falls-short) on the two tasks where"
+        " it was tried.",
         "## Table 3: suitable instructions",
         "Of the instructions chosen for 20,000 fresh states, the share that is suitable, and the"
         " share of states that got one. `at most` is the share of states that any instruction of"
@@ -202,7 +214,9 @@ def content() -> str:
         " the demonstrations mentions.",
         noted(table(success_rows(found, TABLE_4, ZERO_SHOT_PHASES, phases[:2]))),
         "## Figure 5: what is wrong with unsuitable choices",
-        table(counted(found, "phase-1", ERRORS, lambda results: results["suitability"]["errors"])),
+        table(
+            counted(found, ("phase-1",), ERRORS, lambda results: results["suitability"]["errors"])
+        ),
         "## Figure 6: what phase 2 changes",
         "Scenes that only one of the two policies solves, by what the other one did there.",
         table(change_rows(found)),

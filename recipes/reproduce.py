@@ -25,13 +25,13 @@ from ifo_grounding.data import babyai
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json
 
-PHASES = ("phase-1", "pairs-5000", "pairs-10000")
 GOAL = "goal-pairs-5000"
 """Phase 2 paid for the goal, of the preset whose own phase 2 is paid for actions."""
+PHASES = ("phase-1", "pairs-5000", "pairs-10000", GOAL)
 ZERO_SHOT = ("zero-shot", "zero-shot-pairs-5000")
 UNSEEN = "zero-shot-unseen"
 WANTED = {
-    ("table", 2): (*PHASES, GOAL),
+    ("table", 2): PHASES,
     ("table", 3): PHASES[:1],
     ("table", 4): (*ZERO_SHOT, UNSEEN),
     ("figure", 5): PHASES[:1],
@@ -197,7 +197,7 @@ def wanted_phases(options: DictConfig) -> list[str]:
     for kind, number in asked:
         check_choice(kind, number, [of for which, of in WANTED if which == kind])
     needed = {phase for key in asked for phase in WANTED[key]}
-    return [phase for phase in (*PHASES, GOAL, *ZERO_SHOT, UNSEEN) if phase in needed]
+    return [phase for phase in (*PHASES, *ZERO_SHOT, UNSEEN) if phase in needed]
 
 
 def chain(
@@ -208,7 +208,7 @@ def chain(
     for phase in phases:
         if phase == GOAL and preset != "paper":
             continue  # paid for the goal as it is
-        first = next(of[0] for of in ((*PHASES, GOAL), ZERO_SHOT, (UNSEEN,)) if phase in of)
+        first = next(of[0] for of in (PHASES, ZERO_SHOT, (UNSEEN,)) if phase in of)
         names = {part: f"tables-{task}-{preset}-{part}-seed{seed}" for part in (phase, first)}
         given = {
             "task": task,
