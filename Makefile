@@ -7,7 +7,7 @@ DEV := .venv/.installed-dev
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-slow bench lint types docs format wheel clean
+.PHONY: help demo test test-slow test-browser bench lint types docs format wheel clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -20,6 +20,10 @@ test: $(DEV) ## all fast tests, doctests and examples of the docs; line coverage
 
 test-slow: $(DEV) ## tests that train for minutes
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) -m slow --timeout 3600 $(ARGS)
+
+test-browser: $(DEV) ## tests that open pages in headless Chromium: the system's, or Playwright's own
+	command -v chromium chromium-browser >/dev/null || $(BIN)/playwright install chromium
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m browser tests/browser $(ARGS)
 
 bench: $(DEV) ## speed of every part beside peers, in under ten minutes (ARGS="pixels step")
 	for peer in navix minigrid imitation; do \

@@ -11,6 +11,7 @@ from PIL import Image
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.report import (
+    audit_figure,
     compared_rates,
     confusion,
     figure_png,
@@ -54,6 +55,17 @@ def test_shares_are_drawn_in_percent_and_losses_are_not():
     shares, losses = figure.axes
     assert shares.yaxis.get_major_formatter()(0.5) == "50%"
     assert losses.get_ylim()[1] > 1.02
+
+
+def test_an_audit_leaves_out_what_is_undefined_and_shows_all_iterations_in_every_panel():
+    nan = float("nan")
+    history = [{"step": float(step), "entropy": 0.5, "judge_auc": nan} for step in range(1, 9)]
+    history[-1] |= {"success": 1.0, "success_sampled": 0.98, "action_auc": nan}
+    success, entropy = audit_figure(history).axes
+    assert success.get_title(loc="left") == "True success"
+    assert success.get_xlim() == entropy.get_xlim() == (0.5, 8.5)
+    assert [line.get_ydata() for line in success.lines] == [(1.0,), (0.98,)]
+    assert max(tick for tick in success.get_yticks() if tick <= success.get_ylim()[1]) <= 1.0
 
 
 def test_success_has_its_interval_as_a_band():

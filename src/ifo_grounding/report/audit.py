@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -37,7 +38,8 @@ def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
 
     Args:
         history: what ``self_examine`` returned, with the metrics of the recipes' audit; metrics
-            that an iteration lacks are left out.
+            that an iteration lacks are left out, as are those that are not defined there (how well
+            a judge ranks, where every episode succeeds).
 
     Raises:
         UserError: where the history holds none of the metrics of the picture.
@@ -46,8 +48,9 @@ def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
     >>> [axes.get_title(loc="left") for axes in audit_figure(rows).axes if axes.get_visible()]
     ['True success', 'Entropy of the policy']
     """
+    known = {name: _known(history, name) for lines in PANELS.values() for name in lines}
     found = {
-        title: {name: label for name, label in lines.items() if any(name in row for row in history)}
+        title: {name: label for name, label in lines.items() if known[name]}
         for title, lines in PANELS.items()
     }
     found = {title: lines for title, lines in found.items() if lines}
@@ -61,17 +64,28 @@ def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
     for axes, (title, lines) in zip(grid.flat, found.items(), strict=False):
         _dress(axes, title, "iteration")
         for (name, label), colour in zip(lines.items(), PALETTE, strict=False):
-            known = [row for row in history if name in row]
-            steps, values = [row["step"] for row in known], [row[name] for row in known]
-            marker = "o" if len(known) <= 30 else ""
+            marker = "o" if len(known[name]) <= 30 else ""
             axes.plot(
-                steps, values, color=colour, linewidth=1.8, marker=marker, ms=3.5, label=label
+                *zip(*known[name], strict=True),
+                color=colour,
+                linewidth=1.8,
+                marker=marker,
+                ms=3.5,
+                label=label,
             )
+        axes.set_xlim(history[0]["step"] - 0.5, history[-1]["step"] + 0.5)
         axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
         if any(name in SHARES for name in lines):
-            peak = max(row[name] for row in history for name in lines if name in row)
-            _percent(axes, low=min(axes.get_ylim()[0], 0.9))
-            axes.set_ylim(top=1.02 * max(1.0, peak))  # a return can exceed 1
+            low = min(axes.get_ylim()[0], 0.9)
+            top = max(1.0, *(value for name in lines for _, value in known[name]))
+            _percent(axes, low)
+            axes.set_ylim(top=top + 0.05 * (top - low))  # a return can exceed 1
         if len(lines) > 1:
             _legend(axes, loc="best")
     return figure
+
+
+def _known(history: Sequence[Mapping[str, float]], name: str) -> list[tuple[float, float]]:
+    """Iterations at which a metric is known, and its values."""
+    rows = [(row["step"], row[name]) for row in history if name in row]
+    return [(step, value) for step, value in rows if np.isfinite(value)]

@@ -118,7 +118,7 @@ def training_curves(
         axes.plot(
             steps, smoothed(values, span), color=PALETTE[0], linewidth=1.8, marker=marker, ms=3.5
         )
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=5))
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
         if chosen[index].rpartition("_")[2] in SHARES and max(values) > 0.1:
             _percent(axes)
     return figure
@@ -160,6 +160,7 @@ def success_over_iterations(
     if before is not None:
         label = f"phase 1: {100 * before.rate:.1f}%"
         axes.axhline(before.rate, color=LIGHT["faint"], linestyle="--", linewidth=1.4, label=label)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _percent(axes)
     if before is not None or len(lines) > 1:
         _legend(axes, loc="best")

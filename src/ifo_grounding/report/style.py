@@ -31,6 +31,10 @@ th, td { text-align: left; padding: .4rem 1.2rem .4rem 0; border-bottom: 1px sol
 th { font-size: .85rem; color: var(--faint); font-weight: 600; }
 td.figure { white-space: nowrap; }
 td .detail { font-size: .82rem; }
+@media (max-width: 40rem) {
+  th, td { padding-right: .7rem; }
+  td.figure { white-space: normal; }
+  td .detail { display: block; } }
 img { max-width: 100%; height: auto; display: block; }
 .plot img, img.frames { border-radius: 10px; border: 1px solid var(--line); max-width: none; }
 img.frames { background: #fff; }

@@ -1,0 +1,143 @@
+"""The report of a run, opened in headless Chromium as a reader would open it."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from playwright.sync_api import sync_playwright
+
+from ifo_grounding._recipes import recipes_folder
+
+pytestmark = pytest.mark.browser
+
+SCREENS = {"desktop": (1280, 900), "phone": (390, 844)}
+FLAGS = ["--no-sandbox", "--disable-background-networking", "--disable-component-update"]
+
+
+@pytest.fixture(scope="module")
+def page_of_a_run(tmp_path_factory):
+    """The report of both phases, made by the recipes."""
+    from hydra import compose, initialize_config_dir
+
+    run = tmp_path_factory.mktemp("browser") / "run"
+    sys.path.insert(0, str(recipes_folder()))
+    try:
+        from two_phase import two_phase
+
+        from report import report
+
+        with initialize_config_dir(version_base=None, config_dir=str(recipes_folder() / "conf")):
+            options = compose(
+                "two_phase",
+                ["task=pick", "budget=tiny", f"run={run}", "progress=false", "threads=1"],
+            )
+        two_phase(options)
+        return report(options)
+    finally:
+        sys.path.remove(str(recipes_folder()))
+        for name in [path.stem for path in recipes_folder().glob("*.py")]:
+            sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """The system's Chromium; Playwright's own where there is none."""
+    program = shutil.which("chromium") or shutil.which("chromium-browser")
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=program, args=FLAGS)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(params=[(s, c) for s in SCREENS for c in ("light", "dark")], ids="-".join)
+def opened(request, browser, page_of_a_run):
+    """The report on one screen in one colour scheme, and what it asked for and complained of."""
+    screen, scheme = request.param
+    width, height = SCREENS[screen]
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, color_scheme=scheme, offline=True
+    )
+    page = context.new_page()
+    page.asked, page.complaints, page.scheme = [], [], scheme
+    page.on("request", lambda request: page.asked.append(request.url))
+    page.on("console", lambda message: page.complaints.append(message.text))
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    page.goto(page_of_a_run.as_uri())
+    page.wait_for_function("[...document.images].every(image => image.complete)")
+    yield page
+    context.close()
+
+
+def test_it_needs_no_network_and_shows_every_picture(opened, page_of_a_run):
+    outside = [url for url in opened.asked if not url.startswith("data:")]
+    assert outside == [page_of_a_run.as_uri()]
+    assert opened.complaints == []
+    widths = opened.evaluate("[...document.images].map(image => image.naturalWidth)")
+    assert len(widths) >= 10
+    assert min(widths) > 0
+    headings = opened.locator("h2").all_inner_texts()
+    for heading in ("Results", "Step by step, scene 0", "Chosen instructions", "Self-examination"):
+        assert heading in headings
+
+
+def test_it_fits_the_screen(opened):
+    overflow = opened.evaluate("document.documentElement.scrollWidth - window.innerWidth")
+    assert overflow <= 0  # what is wider scrolls within its own box
+    small = opened.evaluate(
+        """[...document.querySelectorAll('main *')]
+        .filter(part => [...part.childNodes].some(n => n.nodeType == 3 && n.textContent.trim()))
+        .map(part => parseFloat(getComputedStyle(part).fontSize))"""
+    )
+    assert min(small) >= 12
+
+
+def test_the_table_of_results_shows_whole_intervals(opened):
+    hidden = opened.evaluate(
+        """[...document.querySelectorAll('table')]
+        .map(table => table.scrollWidth - table.parentElement.clientWidth)"""
+    )
+    assert max(hidden) <= 0
+
+
+def test_colours_follow_the_scheme(opened):
+    picture = np.array(Image.open(io.BytesIO(opened.screenshot())).convert("L"))
+    assert (picture[:, :4].mean() < 60) == (opened.scheme == "dark")
+    shown = opened.evaluate(
+        """[...document.querySelectorAll('picture')].map(
+        picture => picture.querySelector('img').currentSrc == picture.querySelector('source').srcset
+        )"""
+    )
+    assert shown
+    assert all(dark == (opened.scheme == "dark") for dark in shown)
+
+
+def test_text_stands_out(opened):
+    """At least 4.5 to 1, as WCAG asks, for every text of the page."""
+    ratios = opened.evaluate(
+        """(() => {
+        const luminance = colour => {
+            const [r, g, b] = colour.match(/[\\d.]+/g).slice(0, 3).map(Number).map(v => v / 255)
+                .map(v => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+            return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+        };
+        const behind = part => {
+            for (; part; part = part.parentElement) {
+                const colour = getComputedStyle(part).backgroundColor;
+                if (!/, 0\\)$|transparent/.test(colour)) return colour;
+            }
+        };
+        return [...document.querySelectorAll('main *')]
+            .filter(part => [...part.childNodes].some(n => n.nodeType == 3 && n.textContent.trim()))
+            .map(part => {
+                const pair = [luminance(getComputedStyle(part).color), luminance(behind(part))];
+                const [low, high] = pair.sort((a, b) => a - b);
+                return (high + 0.05) / (low + 0.05);
+            });
+        })()"""
+    )
+    assert min(ratios) >= 4.5
