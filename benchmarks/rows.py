@@ -131,25 +131,27 @@ def world_pixels() -> Row:
 
 
 def env_rollout() -> Row:
-    batch, steps = 1024, 20
+    batch, steps, times = 1024, 20, 9  # scenes are drawn for some two rollouts at once
     env = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
     bare = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
 
     def rollout() -> float:
-        env.rollout(steps, break_when_any_done=False)
-        return batch * steps
+        for _ in range(times):
+            env.rollout(steps, break_when_any_done=False)
+        return batch * steps * times
 
     def simulate() -> float:
         rows = torch.arange(batch, device=DEVICE)
-        bare.simulator.reset(rows)
-        for action in torch.randint(6, (steps, batch), device=DEVICE):
-            _, terminated, truncated = bare.simulator.step(action)
-            bare.simulator.pixels()
-            ended = (terminated | truncated).nonzero().squeeze(-1)
-            if len(ended):
-                bare.simulator.reset(ended)
-                bare.simulator.pixels(ended)
-        return batch * steps
+        for _ in range(times):
+            bare.simulator.reset(rows)
+            for action in torch.randint(6, (steps, batch), device=DEVICE):
+                _, terminated, truncated = bare.simulator.step(action)
+                bare.simulator.pixels()
+                ended = (terminated | truncated).nonzero().squeeze(-1)
+                if len(ended):
+                    bare.simulator.reset(ended)
+                    bare.simulator.pixels()
+        return batch * steps * times
 
     return Row(
         "PickAndPlaceEnv.rollout with resets, batch 1,024",

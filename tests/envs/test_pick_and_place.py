@@ -228,18 +228,18 @@ def test_streams_and_splits_reach_the_scenes():
 def test_steps_and_rewards_agree_with_the_plain_rules(task):
     env = PickAndPlaceEnv(task, 32, seed=0, max_steps=20)
     td = env.reset()
-    start = worlds = plain(env.simulator.scene.state)
+    start = worlds = plain(env.simulator.state)
     goals = list(wishes(grammar(task).parse_tokens(td["instruction"])))
     draw = torch.Generator().manual_seed(0)
     ends = 0
     for time in range(20):
         guess = torch.randint(6, (32,), generator=draw)
-        known = expert.act(env.simulator.scene.state, env.simulator.scene.wanted, draw)
+        known = expert.act(env.simulator.state, env.simulator.wanted, draw)
         actions = torch.where(torch.rand(32, generator=draw) < 0.1, guess, known)
         after = choose(env, td, actions)
         worlds = [act(w, LETTERS[a]) for w, a in zip(worlds, actions.tolist(), strict=True)]
-        assert plain(env.simulator.scene.state) == worlds
-        assert torch.equal(after["pixels"], render(env.simulator.scene.state))
+        assert plain(env.simulator.state) == worlds
+        assert torch.equal(after["pixels"], render(env.simulator.state))
         over = [a == STOP or time == 19 for a in actions.tolist()]
         rewards = [
             float(ended and holds(first, world, goal))
@@ -257,7 +257,7 @@ def test_the_expert_earns_one_reward_at_the_end(task):
     env = PickAndPlaceEnv(task, 64, seed=0)
 
     def policy(td):
-        return td.set("action", expert.act(env.simulator.scene.state, env.simulator.scene.wanted))
+        return td.set("action", expert.act(env.simulator.state, env.simulator.wanted))
 
     rollout = env.rollout(41, policy, break_when_all_done=True, break_when_any_done=False)
     reward, done = rollout["next", "reward"], rollout["next", "done"]
@@ -282,12 +282,12 @@ def test_success_is_judged_when_time_runs_out(late):
     """The last move of the expert comes as action 40, or one too late."""
     env = PickAndPlaceEnv("pick", 64, seed=0)
     td = env.reset()
-    scene = env.simulator.scene.clone()
+    scene = env.simulator.stream.scenes(env.scene_numbers)
     idles = scene.state.objects[torch.arange(64), scene.state.arm] == 0  # P does nothing there
     assert idles.sum() > 30
     begins = 40 - (scene.wanted.steps - 1) + late
     for time in range(40):
-        wise = expert.act(env.simulator.scene.state, scene.wanted)
+        wise = expert.act(env.simulator.state, scene.wanted)
         after = choose(env, td, torch.where(time < begins, PICK_PLACE, wise))
         td = after.exclude("reward")
         assert bool(after["truncated"].all()) == (time == 39)
@@ -337,6 +337,38 @@ def test_partial_resets_touch_only_their_rows():
     # The next step goes on from there in all rows.
     shown = choose(env, after, torch.full((6,), STOP))
     assert torch.equal(shown["pixels"], after["pixels"])
+
+
+@pytest.mark.parametrize("foreign", [False, True])
+@pytest.mark.parametrize("instructed", [False, True])
+def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
+    """So many that only what changed is drawn; with an entry of others, as EnvBase resets it."""
+    env = PickAndPlaceEnv("pick", 256, seed=0, instructed=instructed)
+    td = env.reset()
+    for turn in range(8):
+        actions = 1 + torch.randint(5, (256,))
+        running = choose(env, td, actions).exclude("reward").set("action", actions)
+        assert torch.equal(running["pixels"], render(env.simulator.state))
+        numbers, mask = env.scene_numbers.clone(), torch.rand(256) < 0.2
+        given = running.clone().set("_reset", mask.unsqueeze(-1))
+        if foreign:
+            given["count"] = torch.ones(256, 1)
+        td = env.reset(given)
+        assert torch.equal(td["pixels"], render(env.simulator.state))
+        assert torch.equal(td["done"], running["done"] & ~mask.unsqueeze(-1))
+        assert torch.equal(td["action"], actions * ~mask)
+        assert torch.equal(env.scene_numbers != numbers, mask)
+        assert "_reset" not in td
+        if foreign:
+            assert torch.equal(td["count"].squeeze(-1) == 0, mask)
+        if instructed:
+            began = env.simulator.stream.scenes(env.scene_numbers)
+            assert torch.equal(td["instruction"], began.instruction)
+            assert torch.equal(env.simulator.wanted.objects, began.wanted.objects)
+        if turn % 2:  # twice, and a step, before anybody looks
+            env.simulator.reset(mask.nonzero().squeeze(-1)[:3])
+            env.simulator.step(torch.randint(5, (256,)))
+            assert torch.equal(env.simulator.pixels(), render(env.simulator.state))
 
 
 def test_a_reset_of_no_row_changes_nothing():
@@ -397,13 +429,13 @@ def test_an_episode_can_begin_in_a_given_state():
     assert_same(again, first)
     assert env.scene_numbers.tolist() == [-1] * 5
     for _ in range(40):
-        wise = expert.act(env.simulator.scene.state, env.simulator.scene.wanted)
+        wise = expert.act(env.simulator.state, env.simulator.wanted)
         again = choose(env, again, wise).exclude("reward")
         if again["done"].all():
             break
     goals = grammar("pick-out").parse_tokens(first["instruction"])
     start = WorldState(**first["state"].to_dict(), batch_size=[5])
-    ends = zip(plain(start), plain(env.simulator.scene.state), wishes(goals), strict=True)
+    ends = zip(plain(start), plain(env.simulator.state), wishes(goals), strict=True)
     assert all(holds(*episode) for episode in ends)
 
 
@@ -431,7 +463,7 @@ def test_render_draws_every_world_large():
     frames = env.render()
     assert isinstance(frames, np.ndarray)
     assert (frames.shape, frames.dtype) == ((3, 192, 192, 3), np.uint8)
-    expected = render(env.simulator.scene.state, 32).permute(0, 2, 3, 1).numpy()
+    expected = render(env.simulator.state, 32).permute(0, 2, 3, 1).numpy()
     assert np.array_equal(frames, expected)
     assert env.render(tile_size=16).shape == (3, 96, 96, 3)
 

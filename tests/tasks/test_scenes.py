@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import hashlib
+
 import pytest
 import torch
 
@@ -63,6 +65,41 @@ def test_chunks_that_are_drawn_side_by_side_are_those_drawn_alone(monkeypatch, o
     monkeypatch.setattr(module, "AHEAD", 1)
     monkeypatch.setattr(module, "BLOCK", CHUNK)
     assert same(together, first(3 * CHUNK, **options))
+
+
+@pytest.mark.parametrize("task", ["move", "pick"])
+def test_looking_at_fewer_draws_than_it_takes_changes_no_scene(task, monkeypatch):
+    expected = first(CHUNK, task=task)
+    enough = SceneStream._propose_enough
+    asked = []
+
+    def few(self, draws, missing, needed):
+        asked.append(needed)
+        return enough(self, draws, missing, min(needed, 40))
+
+    monkeypatch.setattr(SceneStream, "_propose_enough", few)
+    assert same(first(CHUNK, task=task), expected)
+    assert asked[0] == CHUNK
+    assert asked[-1] < CHUNK
+
+
+def test_scenes_are_written_to_rows_of_others():
+    stream = SceneStream(SceneOptions("pick-out"), seed=0)
+    others = stream.scenes(torch.arange(10)).clone()
+    numbers, rows = torch.tensor([7, module.BLOCK + 3, 100]), torch.tensor([9, 0, 4])
+    expected = others.clone()
+    expected[rows] = stream.scenes(numbers)
+    stream.write(numbers, module.scene_leaves(others), rows)
+    assert same(others, expected)
+
+
+def test_scenes_stay_what_they_are():
+    """Results name the scenes that they are about: a change here makes all of them of others."""
+    digest = hashlib.sha256()
+    for task in TASKS:
+        for leaf in module.scene_leaves(first(2 * CHUNK, task=task, stream="evaluation")):
+            digest.update(leaf.numpy().tobytes())
+    assert digest.hexdigest()[:16] == "49e349ca8fb375ae"
 
 
 def test_the_same_seed_gives_the_same_scenes_and_another_seed_others():

@@ -88,7 +88,7 @@ def seed_stream(simulator: Simulator, seed: int | None, draw: np.random.Generato
     """Go to the stream of ``seed``; to a drawn one where there is neither seed nor stream yet."""
     if seed is not None:
         simulator.seed(seed)
-    elif simulator.scene is None:
+    elif not simulator.started:
         simulator.seed(int(draw.integers(2**31)))
 
 
@@ -114,7 +114,7 @@ def act(simulator: Simulator, actions: np.ndarray) -> tuple[np.ndarray, np.ndarr
         ResetNeeded: before the first reset.
         UserError: unless actions are integers 0..5, [num_envs].
     """
-    if simulator.scene is None:
+    if not simulator.started:
         raise gymnasium.error.ResetNeeded("call reset() before step()")
     if (
         actions.shape != (simulator.num_envs,)
@@ -142,6 +142,6 @@ def observe(simulator: Simulator, rows: np.ndarray | None = None) -> Observation
 
 def draw_frames(simulator: Simulator) -> np.ndarray:
     """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
-    if simulator.scene is None:
+    if not simulator.started:
         raise gymnasium.error.ResetNeeded("call reset() before render()")
     return simulator.pixels(tile_size=RENDER_TILE_SIZE).permute(0, 2, 3, 1).cpu().numpy()

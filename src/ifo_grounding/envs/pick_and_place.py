@@ -24,6 +24,7 @@ from ifo_grounding.world.tiles import TILE_SIZES
 
 RENDER_TILE_SIZE = 32
 STATE = "state"
+DONE = ("done", "terminated", "truncated")
 LEAVES = ("arm", "held", "objects", "boxes")
 
 
@@ -102,6 +103,7 @@ class PickAndPlaceEnv(EnvBase):
         self.vocabulary_size, self.instruction_length = len(VOCABULARY), VOCABULARY.length
         seed = secrets.randbits(31) if seed is None else seed
         self.simulator = Simulator(self.options, num_envs, seed, tile_size, self.device)
+        self._shown = [keys.PIXELS, keys.INSTRUCTION] if instructed else [keys.PIXELS]
         self._make_specs()
 
     @property
@@ -137,7 +139,7 @@ class PickAndPlaceEnv(EnvBase):
         self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
         flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
-            {name: flag.clone() for name in ("done", "terminated", "truncated")},
+            {name: flag.clone() for name in DONE},
             shape=batch,
             device=device,
         )
@@ -159,7 +161,7 @@ class PickAndPlaceEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None or self.simulator.scene is None:
+        if mask is None or not self.simulator.started:
             rows = torch.arange(self.num_envs, device=self.device)
         else:
             rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
@@ -173,29 +175,36 @@ class PickAndPlaceEnv(EnvBase):
                 numbers = numbers.reshape(self.num_envs)[rows]
             self.simulator.reset(rows, numbers)
         result = self._observe()
-        for name in ("done", "terminated", "truncated"):
+        for name in DONE:
             result[name] = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         return result
 
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        """Keep the images of all rows, new and running ones, as the reset drew them.
+        """Keep what the reset shows of all rows, new and running ones.
 
         EnvBase chooses between old and new pixel by pixel, which takes longer than all else in a
-        step. Only where states can be given does the caller know better than the simulator.
+        step. Only where states can be given does the caller know better than the simulator, and
+        only EnvBase knows what to do with entries of others.
         """
-        if self.expose_state or tensordict is None or keys.PIXELS not in tensordict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if tensordict is None or mask is None or self.expose_state:
             return super()._reset_proc_data(tensordict, tensordict_reset)
-        pixels = tensordict_reset.pop(keys.PIXELS)
-        merged = super()._reset_proc_data(tensordict.exclude(keys.PIXELS), tensordict_reset)
-        return merged.set(keys.PIXELS, pixels)
+        merged = {name: tensordict_reset[name] for name in self._shown}
+        if set(DONE) <= tensordict.keys() <= {"_reset", keys.ACTION, *self._shown, *DONE}:
+            goes_on = ~mask.reshape(self.num_envs)
+            merged |= {name: tensordict[name] & goes_on.unsqueeze(-1) for name in DONE}
+            if keys.ACTION in tensordict:
+                merged[keys.ACTION] = tensordict[keys.ACTION] * goes_on
+            return TensorDict(merged, batch_size=self.batch_size, device=self.device)
+        rest = tensordict.exclude(*self._shown)
+        return super()._reset_proc_data(rest, tensordict_reset.exclude(*self._shown)).update(merged)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
-            assert self.simulator.scene is not None, "reset before stepping"
             # A copy: later resets write into the simulator's state, not into the caller's.
-            self.simulator.scene.state = self._world(given).clone()
+            self.simulator.state = self._world(given).clone()
         success, terminated, truncated = self.simulator.step(tensordict.get(keys.ACTION))
         result = self._observe()
         result[keys.REWARD] = success.float().unsqueeze(-1)
@@ -210,8 +219,7 @@ class PickAndPlaceEnv(EnvBase):
         if self.instructed:
             result[keys.INSTRUCTION] = self.simulator.instruction.clone()
         if self.expose_state:
-            assert self.simulator.scene is not None
-            state = self.simulator.scene.state
+            state = self.simulator.state
             leaves = {leaf: getattr(state, leaf).clone() for leaf in LEAVES}
             result[STATE] = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
         return result

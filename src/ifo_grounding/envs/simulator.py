@@ -7,9 +7,19 @@ from torch import Tensor
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
-from ifo_grounding.tasks.goals import fulfilled
-from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
-from ifo_grounding.world import Canvas, render, step
+from ifo_grounding.tasks.goals import Plan, fulfilled
+from ifo_grounding.tasks.scenes import (
+    Scene,
+    SceneOptions,
+    SceneStream,
+    plan_leaves,
+    scene_leaves,
+    state_leaves,
+)
+from ifo_grounding.world import Canvas, WorldState, render, step
+
+MOST_REMEMBERED = 8
+"""Steps and resets between two pictures of all worlds, beyond which all cells are looked at."""
 
 
 class Simulator:
@@ -35,14 +45,49 @@ class Simulator:
         self.device = torch.device(device or "cpu")
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.numbers = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
-        self.scene: Scene | None = None
+        self._episodes: _Episodes | None = None
         self._canvas = Canvas(tile_size)
+        # Places that may have changed since all were drawn, world and cell as one number.
+        self._touched: list[Tensor] | None = None  # None: any place
+        cells = options.layout.size**2
+        self._first_cell = cells * torch.arange(num_envs, device=self.device)
+        self._every_cell = torch.arange(cells, device=self.device)
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
         """Go to the first scene of the stream of this seed."""
         self.stream = SceneStream(self.options, seed, self.device)
         self.next_number = 0
+
+    @property
+    def started(self) -> bool:
+        """Whether there has been a reset."""
+        return self._episodes is not None
+
+    @property
+    def state(self) -> WorldState:
+        """The worlds as they are, [num_envs]."""
+        return self._running.state
+
+    @state.setter
+    def state(self, state: WorldState) -> None:
+        self._running.state = state
+        self._touched = None
+
+    @property
+    def wanted(self) -> Plan:
+        """The goals, resolved in the states in which the episodes began, [num_envs]."""
+        return self._running.wanted
+
+    @property
+    def instruction(self) -> Tensor:
+        """Tokens of each row's instruction, int64 [num_envs, 16]."""
+        return self._running.instruction
+
+    @property
+    def _running(self) -> _Episodes:
+        assert self._episodes is not None, "reset first"
+        return self._episodes
 
     def reset(self, rows: Tensor, numbers: Tensor | None = None) -> None:
         """Begin new episodes in some rows.
@@ -55,17 +100,34 @@ class Simulator:
             first = self.next_number
             numbers = torch.arange(first, first + len(rows), device=self.device)
             self.next_number += len(rows)
-        self.place(rows, self.stream.scenes(numbers))
+        if self._episodes is None:
+            self.place(rows, self.stream.scenes(numbers))
+        else:
+            self.stream.write(numbers, self._episodes.leaves(), rows)
+            self._begin(rows)
         self.numbers[rows] = numbers
 
     def place(self, rows: Tensor, scenes: Scene) -> None:
         """Begin episodes with given scenes [R] in some rows."""
-        if self.scene is None:
+        if self._episodes is None:
             # Every row needs a valid scene before any of them is replaced.
-            self.scene = scenes[torch.zeros(self.num_envs, dtype=torch.int64)].clone()
-        self.scene[rows] = scenes
-        self.steps[rows] = 0
+            every = scenes[torch.zeros(self.num_envs, dtype=torch.int64)].clone()
+            self._episodes = _Episodes(every.state, every.wanted, every.instruction)
+        for leaf, new in zip(self._episodes.leaves(), scene_leaves(scenes), strict=True):
+            leaf.index_copy_(0, rows, new)
+        self._begin(rows)
         self.numbers[rows] = -1
+
+    def _begin(self, rows: Tensor) -> None:
+        self.steps[rows] = 0
+        self._touch(self._first_cell.index_select(0, rows).unsqueeze(-1) + self._every_cell)
+
+    def _touch(self, places: Tensor) -> None:
+        """Remember that some places, [R, K], may have changed since all worlds were drawn."""
+        if self._touched is not None and len(self._touched) < MOST_REMEMBERED:
+            self._touched.append(places.view(-1))
+        else:
+            self._touched = None
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Apply one action, int64 [num_envs], to each row.
@@ -77,31 +139,40 @@ class Simulator:
         Raises:
             UserError: where actions have another shape, such as one-hot actions.
         """
-        assert self.scene is not None, "reset before stepping"
         if action.shape != self.steps.shape:
             raise UserError(
                 f"actions must be one integer for each of {self.num_envs} worlds, "
                 f"got shape {list(action.shape)}"
             )
-        self.scene.state = step(self.scene.state, action)
+        before = self._running.state
+        self._running.state = state = step(before, action)
+        # Side by side, for pictures are drawn fastest in the order in which they lie.
+        arms = torch.stack([before.arm, state.arm], dim=-1)
+        self._touch(arms + self._first_cell.unsqueeze(-1))
         self.steps = self.steps + 1
         terminated = action == STOP
         truncated = (self.steps >= self.options.max_steps) & ~terminated
         ended = terminated | truncated
         if not self.options.instructed:
             return torch.zeros_like(ended), terminated, truncated
-        return ended & fulfilled(self.scene.state, self.scene.wanted), terminated, truncated
-
-    @property
-    def instruction(self) -> Tensor:
-        """Tokens of each row's instruction, int64 [num_envs, 16]."""
-        assert self.scene is not None, "reset before reading the instruction"
-        return self.scene.instruction
+        return ended & fulfilled(state, self.wanted), terminated, truncated
 
     def pixels(self, rows: Tensor | None = None, tile_size: int | None = None) -> Tensor:
         """Draw some rows or all of them, uint8 [R, 3, H, W]."""
-        assert self.scene is not None, "reset before drawing"
         if rows is None and tile_size is None:
-            return self._canvas.draw(self.scene.state)
-        state = self.scene.state if rows is None else self.scene.state[rows]
+            touched, self._touched = self._touched, []
+            return self._canvas.draw(self.state, torch.cat(touched) if touched else None)
+        state = self.state if rows is None else self.state[rows]
         return render(state, tile_size or self.tile_size)
+
+
+class _Episodes:
+    """A scene for each row, whose state goes on."""
+
+    def __init__(self, state: WorldState, wanted: Plan, instruction: Tensor) -> None:
+        self.state, self.wanted, self.instruction = state, wanted, instruction
+        self._asked = [*plan_leaves(wanted), instruction]  # written to, and never replaced
+
+    def leaves(self) -> list[Tensor]:
+        """Everything that episodes are made of, as of scenes."""
+        return [*state_leaves(self.state), *self._asked]

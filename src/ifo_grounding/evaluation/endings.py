@@ -148,9 +148,7 @@ def _play(
     policy: Policy, env: PickAndPlaceEnv, start: TensorDictBase, mode: str
 ) -> Iterator[Tensor]:
     """Yield how each row's episode ended, wanted and mistaken objects [B], and actions [B, T]."""
-    scene = env.simulator.scene
-    assert scene is not None
-    first, wanted = scene.state.clone(), scene.wanted.clone()
+    first, wanted = env.simulator.state.clone(), env.simulator.wanted.clone()
     goal = grammar(env.task).parse_tokens(start[keys.INSTRUCTION])
     last = first.clone()
     shape = (env.num_envs, env.options.max_steps)
@@ -158,8 +156,7 @@ def _play(
     taken = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
 
     def keep(rows: Tensor, transition: TensorDictBase) -> None:
-        assert env.simulator.scene is not None
-        last[rows] = env.simulator.scene.state[rows]
+        last[rows] = env.simulator.state[rows]
         actions[rows, taken[rows]] = transition[keys.ACTION].to(torch.int8)
         taken[rows] += 1
 

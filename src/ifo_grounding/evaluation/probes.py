@@ -125,15 +125,13 @@ def probe(
 def _scenes(task: str, count: int, device: torch.device, **options: Any) -> _Scenes:
     env = PickAndPlaceEnv(task, num_envs=count, device=device, **options)
     start = env.reset()
-    scene = env.simulator.scene
-    assert scene is not None
     goal = grammar(task).parse_tokens(start[keys.INSTRUCTION])
     return _Scenes(
         start[keys.PIXELS],
         start[keys.INSTRUCTION],
-        scene.state.objects.long(),
+        env.simulator.state.objects.long(),
         goal.object.long(),
-        scene.wanted.object_cell,
+        env.simulator.wanted.object_cell,
     )
 
 

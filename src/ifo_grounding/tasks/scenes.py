@@ -7,14 +7,16 @@ number, training and evaluation never meet, and results can name the scenes that
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import torch
 from tensordict import TensorClass
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.seeding import STREAMS, Generators, draw_rows, generator
+from ifo_grounding.seeding import STREAMS, Generators, Shares, draw_rows, generator
 from ifo_grounding.tasks.goals import (
     MAX_STEPS,
     MOVE_UDLR,
@@ -32,10 +34,10 @@ from ifo_grounding.world import Layout, WorldState, random_layout
 
 CHUNK = 1024
 """Scenes that one generator draws."""
-AHEAD = 4
-"""Chunks that are drawn side by side, in some 0.6 times as long as one after another."""
+AHEAD = 8
+"""Chunks that are drawn side by side, in half as long as one after another."""
 BLOCK = AHEAD * CHUNK
-BLOCKS_KEPT = 128
+BLOCKS_KEPT = 64
 PATIENCE = 1000
 """Draws of a chunk after which a layout counts as unable to hold a suitable goal."""
 
@@ -90,6 +92,9 @@ class SceneOptions:
         return Layout(**{**self.layout.__dict__, "excluded_kinds": excluded})
 
 
+PLAN_LEAVES = tuple(each.name for each in fields(Plan))
+
+
 class SceneStream:
     """The scenes of one seed, by number.
 
@@ -104,19 +109,46 @@ class SceneStream:
     ) -> None:
         self.options, self.seed = options, seed
         self.device = torch.device(device or "cpu")
-        self._block = functools.lru_cache(maxsize=BLOCKS_KEPT)(self._draw_block)
+        self._block = functools.lru_cache(maxsize=BLOCKS_KEPT)(self._draw)
 
     def scenes(self, numbers: Tensor) -> Scene:
         """Return the scenes with the given numbers, int64 [N]."""
-        if numbers.numel() and int(numbers.min()) < 0:
+        blocks, rows = self._find(numbers)
+        drawn = [self._block(block)[0] for block in blocks]
+        return (drawn[0] if len(drawn) == 1 else _cat(drawn))[rows]
+
+    def write(self, numbers: Tensor, leaves: list[Tensor], rows: Tensor) -> None:
+        """Write the scenes with the given numbers, int64 [N], to rows of others, int64 [N].
+
+        That is ``others[rows] = self.scenes(numbers)``, in a third of the time.
+
+        Args:
+            numbers: which scenes.
+            leaves: what the others are made of, in the order of :func:`scene_leaves`.
+            rows: where, each once.
+        """
+        blocks, found = self._find(numbers)
+        drawn = [self._block(block)[1] for block in blocks]
+        for leaf, *parts in zip(leaves, *drawn, strict=True):
+            source = parts[0] if len(parts) == 1 else torch.cat(parts)
+            leaf.index_copy_(0, rows, source.index_select(0, found))
+
+    def _find(self, numbers: Tensor) -> tuple[list[int], Tensor]:
+        """Return the blocks that hold given scenes, and the scenes' rows in all of these."""
+        if not numbers.numel():
+            return [0], numbers
+        low, high = (int(end) for end in numbers.aminmax())
+        if low < 0:
             raise UserError("scene numbers start at 0")
-        blocks = (numbers // BLOCK).tolist()
-        distinct = sorted(set(blocks)) or [0]
-        if len(distinct) == 1:
-            return self._block(distinct[0])[numbers % BLOCK]
-        first_row = {block: BLOCK * place for place, block in enumerate(distinct)}
-        start = torch.tensor([first_row[block] for block in blocks], device=numbers.device)
-        return _cat([self._block(block) for block in distinct])[start + numbers % BLOCK]
+        if (first := low // BLOCK) == high // BLOCK:
+            return [first], numbers - first * BLOCK
+        blocks, place = (numbers // BLOCK).unique(return_inverse=True)
+        return blocks.tolist(), place * BLOCK + numbers % BLOCK
+
+    def _draw(self, block: int) -> tuple[Scene, list[Tensor]]:
+        """Return the scenes of a block, and what they are made of."""
+        scenes = self._draw_block(block)
+        return scenes, scene_leaves(scenes)
 
     def _draw_block(self, block: int) -> Scene:
         """Draw the scenes of several chunks on the CPU, so that every device gets the same ones."""
@@ -124,21 +156,24 @@ class SceneStream:
         numbers = range(block * AHEAD, (block + 1) * AHEAD)
         draws = [generator(self.seed, "scenes", options.stream, number) for number in numbers]
         missing = torch.full((AHEAD,), CHUNK)
-        kept: list[Scene] = []
+        needed = CHUNK
+        proposed: list[_Proposal] = []
+        rows: list[Tensor] = []
         owners: list[Tensor] = []
         for _ in range(PATIENCE):
             unfinished = missing.nonzero().squeeze(-1)
-            scenes = self._propose([draws[chunk] for chunk in unfinished])
-            good = torch.ones(len(unfinished), CHUNK, dtype=torch.bool)
-            if options.instructed:
-                good = (scenes.wanted.verdict == SUITABLE).view_as(good)
+            sources = [draws[chunk] for chunk in unfinished]
+            proposal, good = self._propose_enough(sources, missing[unfinished], needed)
             good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
             missing[unfinished] -= good.sum(1)
-            kept.append(scenes[good.flatten()])
+            rows.append(good.flatten().nonzero().squeeze(-1) + sum(map(len, proposed)))
+            proposed.append(proposal)
             owners.append(unfinished.repeat_interleave(good.sum(1)))
             if not missing.any():
                 order = torch.cat(owners).argsort(stable=True)
-                return _cat(kept)[order].to(self.device)
+                return _chosen(proposed, torch.cat(rows)[order], options.task).to(self.device)
+            share = float(good.float().mean())
+            needed = min(CHUNK, int(1.15 * int(missing.max()) / max(share, 1e-3)) + 16)
         raise UserError(
             f"after {PATIENCE * CHUNK} draws only {CHUNK - int(missing.max())} scenes admit a "
             f"suitable goal of {options.task!r} in split {options.split!r} within "
@@ -146,24 +181,88 @@ class SceneStream:
             "steps"
         )
 
-    def _propose(self, draws: list[torch.Generator]) -> Scene:
-        """Draw a chunk of scenes with each generator, suitable or not."""
-        options, n = self.options, CHUNK * len(draws)
+    def _propose_enough(
+        self, draws: list[torch.Generator], missing: Tensor, needed: int
+    ) -> tuple[_Proposal, Tensor]:
+        """Draw a chunk of scenes with each generator, and look at no more of them than it takes.
+
+        Args:
+            draws: generators, G of them.
+            missing: how many scenes each still has to find, int64 [G].
+            needed: how many of a chunk should do; all are looked at if they do not.
+
+        Returns:
+            As many scenes of each generator as were looked at, [G * K], and which of them have a
+            suitable goal, bool [G, K].
+        """
+        before = [draw.get_state() for draw in draws]
+        scenes, good = self._propose(Shares(draws, CHUNK, needed))
+        if needed == CHUNK or (good.sum(1) >= missing).all():
+            return scenes, good
+        for draw, state in zip(draws, before, strict=True):
+            draw.set_state(state)
+        return self._propose(Shares(draws, CHUNK, CHUNK))
+
+    def _propose(self, draws: Shares) -> tuple[_Proposal, Tensor]:
+        """Draw scenes with each generator, and say which are suitable."""
+        options, n = self.options, len(draws)
         state = random_layout(n, options.shown_layout, generator=draws)
         goal = propose_goal(state, check_task(options.task), draws)
         wanted = plan(state, goal, options.max_steps)
-        listed = in_split(goal, options.split, options.holdout)
-        wanted.verdict = torch.where(listed, wanted.verdict, -1)
-        sentences = grammar(options.task)
-        said = torch.zeros(n, sentences.tokens.shape[-1], dtype=torch.int64)
-        wordings = _integers(len(sentences.phrasings), n, draws)
-        accepted = wanted.verdict == SUITABLE
-        said[accepted] = sentences.encode(goal[accepted], wordings[accepted])
-        return Scene(state=state, wanted=wanted, instruction=said, batch_size=[n])
+        if options.split != "all":
+            listed = in_split(goal, options.split, options.holdout)
+            wanted.verdict = torch.where(listed, wanted.verdict, -1)
+        wording = _integers(len(grammar(options.task).phrasings), n, draws)
+        good = wanted.verdict == SUITABLE
+        if not options.instructed:
+            good = torch.ones_like(good)
+        return _Proposal(state, wanted, goal, wording), good.view(len(draws.generators), -1)
+
+
+@dataclass
+class _Proposal:
+    """Scenes of which some will be chosen, and what to say there."""
+
+    state: WorldState
+    wanted: Plan
+    goal: Goal
+    wording: Tensor
+
+    def __len__(self) -> int:
+        return len(self.wording)
+
+
+def _chosen(proposed: Sequence[_Proposal], rows: Tensor, task: str) -> Scene:
+    """Return some scenes of several proposals, with a sentence where there is a goal."""
+
+    def select(name: str) -> Any:
+        return torch.cat([getattr(each, name) for each in proposed])[rows]
+
+    goal, wording, wanted = select("goal"), select("wording"), select("wanted")
+    sentences = grammar(task)
+    said = torch.zeros(len(rows), sentences.tokens.shape[-1], dtype=torch.int64)
+    asked = (wanted.verdict == SUITABLE).nonzero().squeeze(-1)
+    said[asked] = sentences.encode(goal[asked], wording[asked])
+    return Scene(state=select("state"), wanted=wanted, instruction=said, batch_size=[len(rows)])
 
 
 def _integers(high: int, n: int, source: Generators) -> Tensor:
     return draw_rows(lambda n, draw: torch.randint(high, (n,), generator=draw), n, source)
+
+
+def state_leaves(state: WorldState) -> list[Tensor]:
+    """Return what worlds are made of, always in the same order."""
+    return [state.arm, state.held, state.objects, state.boxes]
+
+
+def plan_leaves(wanted: Plan) -> list[Tensor]:
+    """Return what plans are made of, always in the same order."""
+    return [getattr(wanted, each) for each in PLAN_LEAVES]
+
+
+def scene_leaves(scenes: Scene) -> list[Tensor]:
+    """Return what scenes are made of, always in the same order."""
+    return [*state_leaves(scenes.state), *plan_leaves(scenes.wanted), scenes.instruction]
 
 
 def _cat(scenes: list[Scene]) -> Scene:
@@ -174,12 +273,16 @@ def propose_goal(state: WorldState, task: int, source: Generators) -> Goal:
     """Draw a goal about things that are in states [N]; it need not be suitable."""
     shape = state.arm.shape
 
+    def drawn() -> Tensor:
+        return draw_rows(
+            lambda n, draw: torch.rand(n, state.objects.shape[-1], generator=draw),
+            len(state.arm),
+            source,
+        )
+
     def pick(mask: Tensor) -> Tensor:
         """Draw one true cell of each row."""
-        drawn = draw_rows(
-            lambda n, draw: torch.rand(n, *mask.shape[1:], generator=draw), len(mask), source
-        )
-        return (drawn * mask).argmax(-1, keepdim=True)
+        return (drawn() * mask).argmax(-1, keepdim=True)
 
     def at(cells: Tensor, values: Tensor) -> Tensor:
         return values.gather(-1, cells).squeeze(-1).long()
@@ -188,13 +291,17 @@ def propose_goal(state: WorldState, task: int, source: Generators) -> Goal:
     exists = state.objects > 0
     candidates = exists & (state.boxes > 0) if task == PICK_OUT else exists
     cell = pick(candidates)
-    others = state.objects.scatter(-1, cell, 0)
-    other = pick(others > 0)
+    reference = nothing
+    if task == PICK_UDLR:
+        others = state.objects.scatter(-1, cell, 0)
+        reference = at(pick(others > 0), others)
+    else:
+        drawn()  # as of every task, so that scenes stay what they are
     has_box = state.boxes > 0
     return Goal(
         task=torch.full(shape, task),
         object=at(cell, state.objects),
-        reference=at(other, others) if task == PICK_UDLR else nothing,
+        reference=reference,
         source=at(cell, state.boxes) if task == PICK_OUT else nothing,
         target=at(pick(has_box), state.boxes) if task in (PICK, PICK_OUT) else nothing,
         side=_integers(4, len(state.arm), source) if task in (MOVE_UDLR, PICK_UDLR) else nothing,

@@ -8,6 +8,7 @@ the lower right. Tiles of 8 pixels are drawn by hand, larger ones as outlined sh
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 import torch
@@ -18,7 +19,9 @@ from ifo_grounding.errors import check_choice
 from ifo_grounding.world.state import BOX_COLOURS, COLOURS, N_BOXES, N_KINDS, SHAPES, WorldState
 
 TILE_SIZES = (8, 16, 32)
-N_TILES = (N_BOXES + 1) * (N_KINDS + 1) * (N_KINDS + 2)
+PLAIN = (N_BOXES + 1) * (N_KINDS + 1)
+"""States of a cell without the arm."""
+N_TILES = PLAIN * (N_KINDS + 2)
 
 FLOOR = (26, 28, 34)
 GRID = (46, 49, 58)
@@ -69,10 +72,25 @@ def _tile_index(state: WorldState) -> Tensor:
     """Return :func:`tile_index` as int16, in which it is computed."""
     size = state.size
     index = state.boxes.to(torch.int16).add_(state.objects, alpha=N_BOXES + 1)
-    plain = (N_BOXES + 1) * (N_KINDS + 1)
-    carried = state.held.to(torch.int16).add_(1).mul_(plain)
+    carried = state.held.to(torch.int16).add_(1).mul_(PLAIN)
     index.scatter_add_(-1, state.arm.unsqueeze(-1), carried.unsqueeze(-1))
     return index.unflatten(-1, (size, size))
+
+
+def _tiles_at(state: WorldState, places: Tensor) -> Tensor:
+    """Return which tiles worlds [N] show in some places, int16 [M]: those of :func:`_tile_index`.
+
+    Args:
+        state: worlds.
+        places: where: world and cell as one number, int64 [M].
+    """
+    arm, held, objects = state.arm, state.held, state.objects
+    index = state.boxes.flatten().index_select(0, places).to(torch.int16)
+    index.add_(objects.flatten().index_select(0, places), alpha=N_BOXES + 1)
+    world = places.div(objects.shape[-1], rounding_mode="floor")
+    carried = held.index_select(0, world).to(torch.int16).add_(1).mul_(PLAIN)
+    there = arm.index_select(0, world).add_(world, alpha=objects.shape[-1]) == places
+    return index.add_(carried.mul_(there))
 
 
 def render(state: WorldState, tile_size: int = 8) -> Tensor:
@@ -109,22 +127,43 @@ class Canvas:
         self._shown: Tensor | None = None
         self._frames = torch.empty(0)
 
-    def draw(self, state: WorldState) -> Tensor:
-        """Draw worlds [N]: pixels, uint8 [N, 3, H, W], which the caller may write to."""
-        index, shown = _tile_index(state), self._shown
-        words = _words(self.tile_size, str(index.device))
+    def draw(self, state: WorldState, places: Tensor | None = None) -> Tensor:
+        """Draw worlds.
+
+        Args:
+            state: worlds [N].
+            places: where they may have changed since the last picture: world and cell as one
+                number, int64 [M]; anywhere where None.
+
+        Returns:
+            Pixels, uint8 [N, 3, H, W], which the caller may write to.
+        """
+        shown, shape = self._shown, (*state.arm.shape, state.size, state.size)
+        words = _words(self.tile_size, str(state.arm.device))
         # A GPU would have to be waited for, to know what changed.
-        if index.device.type != "cpu" or index.numel() < FEWEST_CELLS:
-            return mosaic.assemble(words, index)
-        self._shown = index
-        if shown is not None and shown.shape == index.shape:
-            changed = index.ne(shown).flatten().nonzero().squeeze(-1)
-            if MOST_CHANGED * len(changed) <= index.numel():
-                tiles = index.flatten().index_select(0, changed).long()
-                mosaic.lay(self._frames, mosaic.words(tile_table(self.tile_size)), changed, tiles)
-                return self._frames.clone()
-        self._frames = mosaic.assemble(words, index)
+        if state.arm.device.type != "cpu" or math.prod(shape) < FEWEST_CELLS:
+            return mosaic.assemble(words, _tile_index(state))
+        if shown is None or shown.shape != shape or not self._redraw(state, shown, places):
+            self._shown = _tile_index(state)
+            self._frames = mosaic.assemble(words, self._shown)
         return self._frames.clone()
+
+    def _redraw(self, state: WorldState, shown: Tensor, places: Tensor | None) -> bool:
+        """Draw the cells that changed, if they are few enough."""
+        before = shown.view(-1)
+        if places is None:
+            index = _tile_index(state).view(-1)
+            changed = index.ne(before).nonzero().squeeze(-1)
+            tiles = index.index_select(0, changed)
+        else:
+            index = _tiles_at(state, places)
+            new = index.ne(before.index_select(0, places)).nonzero().squeeze(-1)
+            changed, tiles = places.index_select(0, new), index.index_select(0, new)
+        if MOST_CHANGED * len(changed) > len(before):
+            return False
+        before.put_(changed, tiles)
+        mosaic.lay(self._frames, mosaic.words(tile_table(self.tile_size)), changed, tiles.long())
+        return True
 
 
 @functools.cache
