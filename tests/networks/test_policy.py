@@ -179,9 +179,14 @@ def test_a_judge_of_words_begins_with_the_policys(shapes, make):
         assert torch.equal(features[:, last], again[:, last])
         first = slice(shapes.vocabulary_size)
         assert not torch.equal(features[:, first], again[:, first])
-    spoken, manner = trunk.words.listen(tokens)
-    words = judge.encode_instruction(tokens)
-    torch.testing.assert_close(words, torch.cat([spoken.flatten(1), manner], -1))
+    (said, manner), words = trunk.words.listen(tokens), judge.encode_instruction(tokens)
+    torch.testing.assert_close(words[:, -manner.shape[1] :], manner)
+    # Which words count for which map is its own to learn.
+    own = words[:, : -manner.shape[1]]
+    assert not torch.isclose(own, said.flatten(1)).all()
+    torch.testing.assert_close(
+        own, make(shapes, "strong", seed=1).encode_instruction(tokens)[:, : own.shape[1]]
+    )
     with pytest.raises(UserError, match="does not fit"):
         make(shapes, "strong", init_from=policy, heads=5)
 

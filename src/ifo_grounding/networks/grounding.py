@@ -32,6 +32,9 @@ FORMS, AROUND = 8, 16
 BEARINGS = 4
 """In how many ways places are read in the light of what is seen, such as where the agent faces."""
 
+MEANING = ("about_colour", "about_form", "side", "around", "manner")
+"""Parts of :class:`WordMaps` that know what words mean; the others know which of them count."""
+
 
 class WordMaps(nn.Module):
     """Maps of where an instruction points, to which each word adds its evidence.

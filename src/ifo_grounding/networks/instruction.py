@@ -20,7 +20,7 @@ from ifo_grounding.networks.building import (
     wrap,
 )
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.grounding import GroundedTrunk
+from ifo_grounding.networks.grounding import MEANING, GroundedTrunk
 from ifo_grounding.networks.scoring import PairScorer, SentenceScorer
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.transfer import copy_weights, trunk_of
@@ -36,6 +36,10 @@ def pair_scorer(shapes: Shapes, config: NetworkConfig, images: int = 1) -> PairS
 def begin_with_policy(network: PairScorer, policy: nn.Module, plan: Blueprint) -> None:
     """Copy what a policy has learned of words, cells and places; of several images, to the last.
 
+    Of words that are read one by one that is what they look like and which side they name. Which
+    of them count for which map is learned anew: a policy may hear object and target in one map,
+    one after the other, which tells nobody whether both are there.
+
     Raises:
         UserError: where the weights do not fit.
     """
@@ -49,7 +53,7 @@ def begin_with_policy(network: PairScorer, policy: nn.Module, plan: Blueprint) -
         assert isinstance(network, WordScorer)
         parts: list[tuple[nn.Module, nn.Module]] = [
             (trunk.looks, network.looks),
-            (trunk.words, network.words),
+            *((getattr(trunk.words, part), getattr(network.words, part)) for part in MEANING),
         ]
         widened: list[tuple[nn.Module, nn.Module]] = [
             (trunk.attention, network.attention),
