@@ -1,4 +1,5 @@
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -44,9 +45,9 @@ def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, pre
     assert "suitable rate" in table
 
     page = report(options)
-    text = page.read_text()
+    text = re.sub("base64,[A-Za-z0-9+/=]+", "", page.read_text())  # which may say anything
     assert "Self-examination" in text
-    assert "http" not in text.replace("http://www.w3.org", "")
+    assert "http" not in text
     audit = json.loads((run / "metrics" / "self_examine.json").read_text())
     assert [row["step"] for row in audit] == [1, 2]
     assert all("success" in row for row in audit)
