@@ -221,6 +221,7 @@ def chain(
             **({} if phase == first else {"base": names[first]}),
             **flat(sections.all),
             **flat(sections.preset[preset]),
+            **flat(sections.preset_of_task.get(preset, {}).get(task, {})),
             **flat(sections.phase[phase]),
         }
         arguments = tuple(f"{name}={value}" for name, value in given.items())

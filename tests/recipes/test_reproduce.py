@@ -72,6 +72,18 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     assert changed.file == second.file and not changed.done
 
 
+def test_a_preset_may_have_options_of_one_task_alone(options):
+    from reproduce import pieces
+
+    for task, expected in {
+        "pick": ["networks.sentence_rate=0.03"],
+        "pick-out": ["networks.sentence_rate=0.1", "networks.sentence_pooling=last"],
+    }.items():
+        (chain,) = pieces(options("figure=6", f"tasks=[{task}]", "presets=[paper]"))
+        for piece in chain:
+            assert [given for given in piece.arguments if "networks" in given] == expected
+
+
 def test_an_ablation_changes_one_thing_of_the_whole(options, tmp_path):
     from reproduce import pieces, reproduce
 
