@@ -78,6 +78,7 @@ def test_looking_at_fewer_draws_than_it_takes_changes_no_scene(task, monkeypatch
         return enough(self, draws, missing, min(needed, 40))
 
     monkeypatch.setattr(SceneStream, "_propose_enough", few)
+    monkeypatch.setattr(module, "ROUNDS_HELD", 2)
     assert same(first(CHUNK, task=task), expected)
     assert asked[0] == CHUNK
     assert asked[-1] < CHUNK

@@ -7,9 +7,8 @@ number, training and evaluation never meet, and results can name the scenes that
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorClass
@@ -38,6 +37,8 @@ AHEAD = 8
 """Chunks that are drawn side by side, in half as long as one after another."""
 BLOCK = AHEAD * CHUNK
 BLOCKS_KEPT = 64
+ROUNDS_HELD = 8
+"""Rounds of draws after which what was refused is let go of, for memory's sake."""
 PATIENCE = 1000
 """Draws of a chunk after which a layout counts as unable to hold a suitable goal."""
 
@@ -166,12 +167,17 @@ class SceneStream:
             proposal, good = self._propose_enough(sources, missing[unfinished], needed)
             good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
             missing[unfinished] -= good.sum(1)
-            rows.append(good.flatten().nonzero().squeeze(-1) + sum(map(len, proposed)))
+            before = sum(len(each.wording) for each in proposed)
+            rows.append(good.flatten().nonzero().squeeze(-1) + before)
             proposed.append(proposal)
             owners.append(unfinished.repeat_interleave(good.sum(1)))
             if not missing.any():
                 order = torch.cat(owners).argsort(stable=True)
-                return _chosen(proposed, torch.cat(rows)[order], options.task).to(self.device)
+                scenes = _said(_chosen(proposed, torch.cat(rows)[order]), options.task)
+                return scenes.to(self.device)
+            if len(proposed) == ROUNDS_HELD:
+                proposed = [_chosen(proposed, torch.cat(rows))]
+                rows = [torch.arange(len(proposed[0].wording))]
             share = float(good.float().mean())
             needed = min(CHUNK, int(1.15 * int(missing.max()) / max(share, 1e-3)) + 16)
         raise UserError(
@@ -219,31 +225,29 @@ class SceneStream:
         return _Proposal(state, wanted, goal, wording), good.view(len(draws.generators), -1)
 
 
-@dataclass
-class _Proposal:
-    """Scenes of which some will be chosen, and what to say there."""
+class _Proposal(NamedTuple):
+    """Scenes, and what might be said there."""
 
     state: WorldState
     wanted: Plan
     goal: Goal
     wording: Tensor
 
-    def __len__(self) -> int:
-        return len(self.wording)
+
+def _chosen(proposed: list[_Proposal], rows: Tensor) -> _Proposal:
+    """Return some scenes of several proposals, numbered one after the other."""
+    parts: list[Any] = [torch.cat(part)[rows] for part in zip(*proposed, strict=True)]
+    return _Proposal(*parts)
 
 
-def _chosen(proposed: Sequence[_Proposal], rows: Tensor, task: str) -> Scene:
-    """Return some scenes of several proposals, with a sentence where there is a goal."""
-
-    def select(name: str) -> Any:
-        return torch.cat([getattr(each, name) for each in proposed])[rows]
-
-    goal, wording, wanted = select("goal"), select("wording"), select("wanted")
-    sentences = grammar(task)
-    said = torch.zeros(len(rows), sentences.tokens.shape[-1], dtype=torch.int64)
+def _said(proposal: _Proposal, task: str) -> Scene:
+    """Return scenes with a sentence for each suitable goal."""
+    state, wanted, goal, wording = proposal
+    sentences, n = grammar(task), len(wording)
+    said = torch.zeros(n, sentences.tokens.shape[-1], dtype=torch.int64)
     asked = (wanted.verdict == SUITABLE).nonzero().squeeze(-1)
     said[asked] = sentences.encode(goal[asked], wording[asked])
-    return Scene(state=select("state"), wanted=wanted, instruction=said, batch_size=[len(rows)])
+    return Scene(state=state, wanted=wanted, instruction=said, batch_size=[n])
 
 
 def _integers(high: int, n: int, source: Generators) -> Tensor:
