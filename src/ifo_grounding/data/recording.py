@@ -89,11 +89,15 @@ def record_demonstrations(  # type: ignore[misc]  # the overloads leave options 
         layout=layout or Layout(),
         max_steps=max_steps,
     )
+    # Every scene is asked for once, in order.
+    drawn = SceneStream(options, derive(seed, "demonstrations"), kept=1)
     parts: list[Tensor] = []
     lengths, instructions, actions = [], [], []
     with _one_thread(), tqdm(total=n, desc="record", disable=not progress) as bar:
         for first in range(0, n, BATCH):
-            scenes, frames, taken = _record_batch(options, seed, first, min(n, first + BATCH))
+            scenes = drawn.scenes(torch.arange(first, min(n, first + BATCH)))
+            ties = generator(seed, "demonstrations", options.stream, "ties", first)
+            frames, taken = _demonstrate(scenes, ties)
             parts.append(frames)
             actions.append(taken)
             lengths.append(scenes.wanted.steps + 1)
@@ -117,16 +121,6 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def _record_batch(
-    options: SceneOptions, seed: int, first: int, end: int
-) -> tuple[Scene, Tensor, Tensor]:
-    # A stream keeps the scenes that it drew: a new one for each batch frees them.
-    stream = SceneStream(options, derive(seed, "demonstrations"))
-    scenes = stream.scenes(torch.arange(first, end))
-    ties = generator(seed, "demonstrations", options.stream, "ties", first)
-    return scenes, *_demonstrate(scenes, ties)
 
 
 def _demonstrate(scenes: Scene, ties: torch.Generator) -> tuple[Tensor, Tensor]:

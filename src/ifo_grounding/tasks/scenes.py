@@ -99,6 +99,12 @@ PLAN_LEAVES = tuple(each.name for each in fields(Plan))
 class SceneStream:
     """The scenes of one seed, by number.
 
+    Args:
+        options: which scenes.
+        seed: of what is drawn.
+        device: where scenes go; they are drawn on the CPU.
+        kept: how many blocks of scenes are remembered, the last that were asked for.
+
     >>> stream = SceneStream(SceneOptions("pick"), seed=0)
     >>> scenes = stream.scenes(torch.tensor([5, 2000]))
     >>> scenes.instruction.shape, scenes.wanted.verdict.tolist()
@@ -106,11 +112,16 @@ class SceneStream:
     """
 
     def __init__(
-        self, options: SceneOptions, seed: int, device: torch.device | str | None = None
+        self,
+        options: SceneOptions,
+        seed: int,
+        device: torch.device | str | None = None,
+        *,
+        kept: int = BLOCKS_KEPT,
     ) -> None:
         self.options, self.seed = options, seed
         self.device = torch.device(device or "cpu")
-        self._block = functools.lru_cache(maxsize=BLOCKS_KEPT)(self._draw)
+        self._block = functools.lru_cache(maxsize=kept)(self._draw)
 
     def scenes(self, numbers: Tensor) -> Scene:
         """Return the scenes with the given numbers, int64 [N]."""
