@@ -152,16 +152,17 @@ class Canvas:
         """Draw the cells that changed, if they are few enough."""
         before = shown.view(-1)
         if places is None:
-            index = _tile_index(state).view(-1)
-            changed = index.ne(before).nonzero().squeeze(-1)
-            tiles = index.index_select(0, changed)
+            index = _tile_index(state)
+            changed = index.view(-1).ne(before).nonzero().squeeze(-1)
+            tiles = index.view(-1).index_select(0, changed)
         else:
-            index = _tiles_at(state, places)
-            new = index.ne(before.index_select(0, places)).nonzero().squeeze(-1)
-            changed, tiles = places.index_select(0, new), index.index_select(0, new)
+            found = _tiles_at(state, places)
+            new = found.ne(before.index_select(0, places)).nonzero().squeeze(-1)
+            changed, tiles = places.index_select(0, new), found.index_select(0, new)
+            index = shown.put_(changed, tiles)
         if MOST_CHANGED * len(changed) > len(before):
             return False
-        before.put_(changed, tiles)
+        self._shown = index
         mosaic.lay(self._frames, mosaic.words(tile_table(self.tile_size)), changed, tiles.long())
         return True
 
