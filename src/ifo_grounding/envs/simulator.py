@@ -50,7 +50,8 @@ class Simulator:
         # Places that may have changed since all were drawn, world and cell as one number.
         self._touched: list[Tensor] | None = None  # None: any place
         cells = options.layout.size**2
-        self._first_cell = cells * torch.arange(num_envs, device=self.device)
+        self._every_row = torch.arange(num_envs, device=self.device)
+        self._first_cell = cells * self._every_row
         self._every_cell = torch.arange(cells, device=self.device)
         self.seed(seed)
 
@@ -120,14 +121,15 @@ class Simulator:
 
     def _begin(self, rows: Tensor) -> None:
         self.steps[rows] = 0
-        self._touch(self._first_cell.index_select(0, rows).unsqueeze(-1) + self._every_cell)
+        self._touch(rows, self._every_cell.expand(len(rows), -1))
 
-    def _touch(self, places: Tensor) -> None:
-        """Remember that some places, [R, K], may have changed since all worlds were drawn."""
-        if self._touched is not None and len(self._touched) < MOST_REMEMBERED:
-            self._touched.append(places.view(-1))
-        else:
+    def _touch(self, rows: Tensor, cells: Tensor) -> None:
+        """Remember that cells [R, K] of some rows may have changed since all were drawn."""
+        if self._touched is None or len(self._touched) == MOST_REMEMBERED:
             self._touched = None
+        else:
+            first = self._first_cell.index_select(0, rows).unsqueeze(-1)
+            self._touched.append((first + cells).view(-1))
 
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Apply one action, int64 [num_envs], to each row.
@@ -146,9 +148,9 @@ class Simulator:
             )
         before = self._running.state
         self._running.state = state = step(before, action)
-        # Side by side, for pictures are drawn fastest in the order in which they lie.
-        arms = torch.stack([before.arm, state.arm], dim=-1)
-        self._touch(arms + self._first_cell.unsqueeze(-1))
+        if self._touched is not None:
+            # Side by side, for pictures are drawn fastest in the order in which they lie.
+            self._touch(self._every_row, torch.stack([before.arm, state.arm], dim=-1))
         self.steps = self.steps + 1
         terminated = action == STOP
         truncated = (self.steps >= self.options.max_steps) & ~terminated
@@ -160,7 +162,8 @@ class Simulator:
     def pixels(self, rows: Tensor | None = None, tile_size: int | None = None) -> Tensor:
         """Draw some rows or all of them, uint8 [R, 3, H, W]."""
         if rows is None and tile_size is None:
-            touched, self._touched = self._touched, []
+            # On a GPU all cells are drawn.
+            touched, self._touched = self._touched, [] if self.device.type == "cpu" else None
             return self._canvas.draw(self.state, torch.cat(touched) if touched else None)
         state = self.state if rows is None else self.state[rows]
         return render(state, tile_size or self.tile_size)
