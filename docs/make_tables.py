@@ -43,10 +43,10 @@ SHOWN_CHANGES = ("pairs-5000", GOAL)
 """Pieces whose phase 2 Fig. 6 compares with phase 1."""
 EARLIER = "†"
 EARLIER_NOTE = f"{EARLIER} made with other options than `reproduce` has today; its file names them."
-PRESET_OPTIONS = OmegaConf.to_container(
-    OmegaConf.load(ROOT / "recipes" / "conf" / "reproduce.yaml").options_of.preset
+OPTIONS_OF: dict[str, Any] = OmegaConf.to_container(  # type: ignore[assignment]
+    OmegaConf.load(ROOT / "recipes" / "conf" / "reproduce.yaml").options_of
 )
-"""What `reproduce` says to each preset today."""
+"""What `reproduce` says to each preset, task and phase today."""
 
 Pieces = dict[Any, list[dict[str, Any]]]
 
@@ -75,10 +75,13 @@ def mark(runs: list[dict[str, Any]]) -> str:
 
 
 def is_of_today(options: dict[str, Any]) -> bool:
-    """Whether options of a piece are those that `reproduce` says to its preset today."""
+    """Whether options of a piece are those that `reproduce` says to its preset and task today."""
+    preset, task = options["network"], options["task"]
+    of_task = OPTIONS_OF["preset_of_task"].get(preset, {}).get(task, {})
+    today = OmegaConf.merge(OPTIONS_OF["preset"][preset], of_task)
     return all(
         options.get(section, {}).get(name) == value
-        for section, values in PRESET_OPTIONS[options["network"]].items()
+        for section, values in today.items()
         for name, value in values.items()
     )
 
