@@ -74,14 +74,19 @@ def mark(runs: list[dict[str, Any]]) -> str:
     return EARLIER if any(not is_of_today(run["options"]) for run in runs) else ""
 
 
+def today(preset: str, task: str) -> dict[str, dict[str, Any]]:
+    """Return the options that `reproduce` says to a preset and a task today, by section."""
+    of_task = OPTIONS_OF["preset_of_task"].get(preset, {}).get(task, {})
+    return OmegaConf.to_container(  # type: ignore[return-value]
+        OmegaConf.merge(OPTIONS_OF["preset"][preset], of_task)
+    )
+
+
 def is_of_today(options: dict[str, Any]) -> bool:
     """Whether options of a piece are those that `reproduce` says to its preset and task today."""
-    preset, task = options["network"], options["task"]
-    of_task = OPTIONS_OF["preset_of_task"].get(preset, {}).get(task, {})
-    today = OmegaConf.merge(OPTIONS_OF["preset"][preset], of_task)
     return all(
         options.get(section, {}).get(name) == value
-        for section, values in today.items()
+        for section, values in today(options["network"], options["task"]).items()
         for name, value in values.items()
     )
 

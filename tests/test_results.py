@@ -144,9 +144,10 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
             },
         },
     }
-    today = script.PRESET_OPTIONS["strong"]
+    today = script.today("strong", "pick")
     earlier = {**today, "imitate": {**today["imitate"], "steps": 1}}
-    of_paper = script.PRESET_OPTIONS["paper"]
+    of_paper = script.today("paper", "pick")
+    assert of_paper["instruction"] == {"steps": 12000, "near": 0.5}  # of the task, too
     for preset, phase, like, said in (
         ("strong", "phase-1", "phase-1", today),
         ("strong", "pairs-5000", "pairs-5000", earlier),
