@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import io
 import shutil
-import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from ifo_grounding._recipes import recipes_folder
+from importing import recipes_importable
 
 pytestmark = pytest.mark.browser
 
 SCREENS = {"desktop": (1280, 900), "phone": (390, 844)}
+TEXTS = """[...document.querySelectorAll('main *')]
+    .filter(part => [...part.childNodes].some(n => n.nodeType == 3 && n.textContent.trim()))"""
 FLAGS = ["--no-sandbox", "--disable-background-networking", "--disable-component-update"]
 
 
@@ -25,23 +26,18 @@ def page_of_a_run(tmp_path_factory):
     from hydra import compose, initialize_config_dir
 
     run = tmp_path_factory.mktemp("browser") / "run"
-    sys.path.insert(0, str(recipes_folder()))
-    try:
+    with recipes_importable() as folder:
         from two_phase import two_phase
 
         from report import report
 
-        with initialize_config_dir(version_base=None, config_dir=str(recipes_folder() / "conf")):
+        with initialize_config_dir(version_base=None, config_dir=str(folder / "conf")):
             options = compose(
                 "two_phase",
                 ["task=pick", "budget=tiny", f"run={run}", "progress=false", "threads=1"],
             )
         two_phase(options)
         return report(options)
-    finally:
-        sys.path.remove(str(recipes_folder()))
-        for name in [path.stem for path in recipes_folder().glob("*.py")]:
-            sys.modules.pop(name, None)
 
 
 @pytest.fixture(scope="module")
@@ -88,11 +84,7 @@ def test_it_needs_no_network_and_shows_every_picture(opened, page_of_a_run):
 def test_it_fits_the_screen(opened):
     overflow = opened.evaluate("document.documentElement.scrollWidth - window.innerWidth")
     assert overflow <= 0  # what is wider scrolls within its own box
-    small = opened.evaluate(
-        """[...document.querySelectorAll('main *')]
-        .filter(part => [...part.childNodes].some(n => n.nodeType == 3 && n.textContent.trim()))
-        .map(part => parseFloat(getComputedStyle(part).fontSize))"""
-    )
+    small = opened.evaluate(f"{TEXTS}.map(part => parseFloat(getComputedStyle(part).fontSize))")
     assert min(small) >= 12
 
 
@@ -131,13 +123,13 @@ def test_text_stands_out(opened):
                 if (!/, 0\\)$|transparent/.test(colour)) return colour;
             }
         };
-        return [...document.querySelectorAll('main *')]
-            .filter(part => [...part.childNodes].some(n => n.nodeType == 3 && n.textContent.trim()))
-            .map(part => {
-                const pair = [luminance(getComputedStyle(part).color), luminance(behind(part))];
-                const [low, high] = pair.sort((a, b) => a - b);
-                return (high + 0.05) / (low + 0.05);
-            });
+        return """
+        + TEXTS
+        + """.map(part => {
+            const pair = [luminance(getComputedStyle(part).color), luminance(behind(part))];
+            const [low, high] = pair.sort((a, b) => a - b);
+            return (high + 0.05) / (low + 0.05);
+        });
         })()"""
     )
     assert min(ratios) >= 4.5

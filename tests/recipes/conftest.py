@@ -1,17 +1,13 @@
-import sys
-
 import pytest
 
-from ifo_grounding._recipes import recipes_folder
+from importing import recipes_importable
 
 
 @pytest.fixture
-def recipes(monkeypatch):
+def recipes():
     """The folder of the recipes, importable."""
-    monkeypatch.syspath_prepend(str(recipes_folder()))
-    yield recipes_folder()
-    for name in [path.stem for path in recipes_folder().glob("*.py")]:
-        sys.modules.pop(name, None)
+    with recipes_importable() as folder:
+        yield folder
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from ifo_grounding.envs.simulator import Simulator
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.tasks.goals import MAX_STEPS, check_task, plan
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.tasks.scenes import Scene, SceneOptions, propose_goal
+from ifo_grounding.tasks.scenes import STATE_LEAVES, Scene, SceneOptions, propose_goal
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import N_BOXES, N_KINDS, Layout, WorldState
 from ifo_grounding.world.tiles import TILE_SIZES
@@ -25,7 +25,6 @@ from ifo_grounding.world.tiles import TILE_SIZES
 RENDER_TILE_SIZE = 32
 STATE = "state"
 DONE = ("done", "terminated", "truncated")
-LEAVES = ("arm", "held", "objects", "boxes")
 
 
 class PickAndPlaceEnv(EnvBase):
@@ -220,12 +219,14 @@ class PickAndPlaceEnv(EnvBase):
             result[keys.INSTRUCTION] = self.simulator.instruction.clone()
         if self.expose_state:
             state = self.simulator.state
-            leaves = {leaf: getattr(state, leaf).clone() for leaf in LEAVES}
+            leaves = {leaf: getattr(state, leaf).clone() for leaf in STATE_LEAVES}
             result[STATE] = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
         return result
 
     def _world(self, given: TensorDictBase) -> WorldState:
-        return WorldState(**{leaf: given[leaf] for leaf in LEAVES}, batch_size=self.batch_size)
+        return WorldState(
+            **{leaf: given[leaf] for leaf in STATE_LEAVES}, batch_size=self.batch_size
+        )
 
     def _given_scene(self, tensordict: TensorDictBase) -> Scene:
         """Make scenes of given states, and of the instructions beside them."""

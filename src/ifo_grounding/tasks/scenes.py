@@ -93,6 +93,7 @@ class SceneOptions:
         return Layout(**{**self.layout.__dict__, "excluded_kinds": excluded})
 
 
+STATE_LEAVES = tuple(each.name for each in fields(WorldState))
 PLAN_LEAVES = tuple(each.name for each in fields(Plan))
 
 
@@ -267,7 +268,7 @@ def _integers(high: int, n: int, source: Generators) -> Tensor:
 
 def state_leaves(state: WorldState) -> list[Tensor]:
     """Return what worlds are made of, always in the same order."""
-    return [state.arm, state.held, state.objects, state.boxes]
+    return [getattr(state, each) for each in STATE_LEAVES]
 
 
 def plan_leaves(wanted: Plan) -> list[Tensor]:
