@@ -5,6 +5,7 @@ from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import ConvInstructionEncoder, GRUInstructionEncoder
+from ifo_grounding.networks.config import POOLINGS
 from ifo_grounding.networks.sentences import beginnings
 from ifo_grounding.tasks import TASKS, VOCABULARY, grammar
 
@@ -37,7 +38,7 @@ def reference_gru(encoder: GRUInstructionEncoder) -> nn.GRU:
     return gru
 
 
-@pytest.mark.parametrize("pooling", ["last", "mean"])
+@pytest.mark.parametrize("pooling", POOLINGS)
 def test_the_papers_encoder_is_the_bidirectional_gru_of_pytorch_over_packed_sentences(pooling):
     torch.manual_seed(0)
     encoder = GRUInstructionEncoder(40, embedding=8, hidden=16, pooling=pooling)
@@ -47,13 +48,16 @@ def test_the_papers_encoder_is_the_bidirectional_gru_of_pytorch_over_packed_sent
     )
     states, last = reference_gru(encoder)(packed)
     padded, lengths = pad_packed_sequence(states, batch_first=True)
-    mean = padded.sum(1) / lengths.unsqueeze(1)
-    expected = mean if pooling == "mean" else torch.cat([last[0], last[1]], -1)
-    torch.testing.assert_close(encoder(tokens), expected)
+    means = (padded.sum(1) / lengths.unsqueeze(1)).chunk(2, -1)
+    both = [last[0], means[0], last[1], means[1]]
+    expected = {"last": [*last], "mean": [*means], "both": both}[pooling]
+    torch.testing.assert_close(encoder(tokens), torch.cat(expected, -1))
 
 
 def test_an_unknown_pooling_is_refused():
-    with pytest.raises(UserError, match="unknown pooling 'max': choose one of 'last', 'mean'"):
+    with pytest.raises(
+        UserError, match="unknown pooling 'max': choose one of 'last', 'mean', 'both'"
+    ):
         GRUInstructionEncoder(40, embedding=8, hidden=16, pooling="max")
 
 
@@ -113,7 +117,7 @@ def test_gradients_are_those_of_encoding_every_row_and_repeat_exactly(encoder):
     assert all(map(torch.equal, once, gradients(encoder)))
 
 
-@pytest.mark.parametrize("pooling", ["last", "mean"])
+@pytest.mark.parametrize("pooling", POOLINGS)
 @pytest.mark.parametrize("task", TASKS)
 def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(
     task, pooling, monkeypatch
@@ -125,7 +129,7 @@ def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(
     ).double()
     known = grammar(task).tokens
     tokens = torch.cat([known[torch.randint(len(known), (300,))], known[:1] * 0])
-    target = torch.randn(len(tokens), 32, dtype=torch.float64)
+    target = torch.randn(len(tokens), encoder.size, dtype=torch.float64)
 
     def encoded(encode):
         encoder.zero_grad()
@@ -139,7 +143,7 @@ def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(
     assert all(map(torch.equal, once, encoded(encoder)))
 
 
-@pytest.mark.parametrize("pooling", ["last", "mean"])
+@pytest.mark.parametrize("pooling", POOLINGS)
 def test_ids_of_padding_between_words_are_words_of_their_own(pooling, monkeypatch):
     monkeypatch.setattr(f"{beginnings.__module__}.ENOUGH_TO_SHARE", 0)
     torch.manual_seed(0)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ifo_grounding.errors import UserError, check_choice
 
-POOLINGS = ("last", "mean")
+POOLINGS = ("last", "mean", "both")
 """Which states of a GRU make an encoded sentence."""
 KINDS = ("inverse", "policy", "value", "instruction", "reward", "goal")
 """The networks of this package."""
@@ -55,7 +55,7 @@ class NetworkConfig:
     embedding: int
     """Size of a word's embedding."""
     hidden: int
-    """Half the size of an encoded sentence: the GRU's state, each way."""
+    """Size of the GRU's state each way: half that of an encoded sentence, of ``"both"`` a quarter."""
     dropout: float
     """Dropout rate before each linear layer of the head."""
     head_hidden: tuple[int, ...]
@@ -69,7 +69,7 @@ class NetworkConfig:
     the scale of a gradient, takes smaller ones (an equalised rate, Karras et al. 2018)."""
     sentence_pooling: str = "last"
     """Which states of a GRU (``words="gru"``) make an encoded sentence: the ``"last"`` of each way,
-    or their ``"mean"`` over words (``paper``)."""
+    their ``"mean"`` over words (``paper``), or ``"both"``, side by side."""
 
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, PRESETS)

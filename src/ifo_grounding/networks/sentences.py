@@ -42,7 +42,7 @@ class InstructionEncoder(nn.Module):
         self.embedding = nn.Embedding(vocabulary_size, embedding, padding_idx=0)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Map token ids [N, L] to features [N, 2 * hidden].
+        """Map token ids [N, L] to features [N, size].
 
         Raises:
             UserError: where an id lies outside the vocabulary.
@@ -52,7 +52,7 @@ class InstructionEncoder(nn.Module):
         return look_up(*self.distinct(tokens))
 
     def distinct(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode the distinct instructions of [N, L]: features [U, 2 * hidden], and which is whose.
+        """Encode the distinct instructions of [N, L]: features [U, size], and which is whose.
 
         Raises:
             UserError: where an id lies outside the vocabulary.
@@ -115,7 +115,7 @@ class GRUInstructionEncoder(InstructionEncoder):
 
     The feature is the mean of the states after every word, the forward ones beside the backward
     ones, or only the last of each way, after which words in the middle of a long sentence are
-    hardly heard to begin with. An instruction of padding alone is zeros.
+    hardly heard to begin with; or both of these. An instruction of padding alone is zeros.
 
     The recurrence is written out, where ``nn.GRU`` would do, because packed sequences do not work
     under ``torch.vmap``, which TorchRL's value estimators use.
@@ -128,7 +128,8 @@ class GRUInstructionEncoder(InstructionEncoder):
         embedding: size of a word's embedding.
         hidden: size of the state, each way.
         rate: how fast it learns, by the rest of a network: weights are kept divided by it.
-        pooling: ``"mean"`` or ``"last"``: which states make the feature.
+        pooling: ``"mean"``, ``"last"`` or ``"both"``: which states make the feature, of size
+            2 * hidden; for both, beside one another each way, 4 * hidden.
 
     >>> encoder = GRUInstructionEncoder(vocabulary_size=40, embedding=8, hidden=64)
     >>> encoder(torch.randint(40, (5, 16))).shape
@@ -147,6 +148,7 @@ class GRUInstructionEncoder(InstructionEncoder):
         self.rate = rate
         check_choice("pooling", pooling, POOLINGS)
         self.pooling = pooling
+        self.size = (4 if pooling == "both" else 2) * hidden
         self.input_weight = nn.Parameter(torch.empty(2, embedding, 3 * hidden))
         self.input_bias = nn.Parameter(torch.zeros(2, 1, 3 * hidden))
         self.state_weight = nn.Parameter(torch.empty(2, hidden, 3 * hidden))
@@ -171,8 +173,8 @@ class GRUInstructionEncoder(InstructionEncoder):
         for given, counts in zip(gates.unbind(2), alive.unbind(1), strict=True):
             recalled = torch.baddbmm(bias, state, weight)
             state = torch.where(counts, self._cell(given, recalled, state), state)
-            total = total + state * counts if self.pooling == "mean" else state
-        return torch.cat(self._pooled(total, lengths).unbind(), -1)
+            total = total if self.pooling == "last" else total + state * counts
+        return torch.cat(self._pooled(self._kept(state, total), lengths).unbind(), -1)
 
     def _encode_distinct(self, tokens: Tensor) -> Tensor:
         """Run the GRU once over what sentences begin with, or end with, alike."""
@@ -188,20 +190,30 @@ class GRUInstructionEncoder(InstructionEncoder):
         """Run one way over rows of ids, each beginning that they have in common once."""
         steps, ends = beginnings(tokens, lengths)
         state = total = table.new_zeros(1, self.hidden)
-        totals = [total]
+        kept = [self._kept(state, total)]
         for word, before in steps:
             state = look_up(state, before)
             recalled = torch.addmm(bias, state, weight)
             state = self._cell(look_up(table, word), recalled, state)
-            total = look_up(total, before) + state if self.pooling == "mean" else state
-            totals.append(total)
-        return self._pooled(look_up(torch.cat(totals), ends), lengths)
+            total = total if self.pooling == "last" else look_up(total, before) + state
+            kept.append(self._kept(state, total))
+        return self._pooled(look_up(torch.cat(kept), ends), lengths)
 
-    def _pooled(self, total: Tensor, lengths: Tensor) -> Tensor:
-        """Return the feature of one way or both, [..., N, hidden], from the sum of its states."""
+    def _kept(self, state: Tensor, total: Tensor) -> Tensor:
+        """Return what counts of the last state and the sum of all."""
+        if self.pooling == "both":
+            return torch.cat([state, total], -1)
+        return total if self.pooling == "mean" else state
+
+    def _pooled(self, kept: Tensor, lengths: Tensor) -> Tensor:
+        """Return the feature of one way or both, from what counts of its states, [..., N, size]."""
         if self.pooling == "last":
-            return total
-        return total / lengths.clamp_min(1).unsqueeze(-1).to(total.dtype)
+            return kept
+        count = lengths.clamp_min(1).unsqueeze(-1).to(kept.dtype)
+        if self.pooling == "mean":
+            return kept / count
+        state, total = kept.chunk(2, -1)
+        return torch.cat([state, total / count], -1)
 
     def _scaled(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return W x + b of each word, U and c, as ``nn.GRUCell`` calls them, each way."""
