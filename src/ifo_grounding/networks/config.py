@@ -55,7 +55,7 @@ class NetworkConfig:
     embedding: int
     """Size of a word's embedding."""
     hidden: int
-    """Size of the GRU's state each way: half an encoded sentence's, of ``"both"`` a quarter of it."""
+    """Size of the GRU's state each way: half an encoded sentence, a quarter with ``"both"``."""
     dropout: float
     """Dropout rate before each linear layer of the head."""
     head_hidden: tuple[int, ...]
