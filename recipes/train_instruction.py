@@ -1,5 +1,8 @@
 """Train the instruction module: which instructions suit a scene (paper, 2nd-phase)."""
 
+import math
+
+import torch
 from _shared import (
     CLASSIFIER,
     load_demonstrations,
@@ -7,13 +10,17 @@ from _shared import (
     starting_policy,
     train,
 )
-from _worlds import build, context_of
+from _worlds import build, context_of, open_world
 from omegaconf import DictConfig
+from torch import Tensor
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import first_frame_buffer
+from ifo_grounding.keys import PIXELS
 from ifo_grounding.networks import make_instruction_classifier
 from ifo_grounding.objectives import InstructionLoss
+
+STATES_AT_ONCE = 256
 
 
 def train_instruction(options: DictConfig) -> dict:
@@ -36,10 +43,22 @@ def train_instruction(options: DictConfig) -> dict:
         contrast=options.instruction.contrast,
         unlabelled=options.instruction.unlabelled,
         near=options.instruction.near,
+        states=fresh_states(options, len(demos)),
+        strict=options.instruction.strict,
     )
     calibrate = loss.calibrate if options.instruction.removal_rate == "estimated" else None
     buffer = first_frame_buffer(demos)
     return train(options, stage, loss, buffer, "instruction", CLASSIFIER, finish=calibrate)
+
+
+def fresh_states(options: DictConfig, demonstrations: int) -> Tensor | None:
+    """Return first frames of the simulator, where there are fewer demonstrations than asked for."""
+    wanted = options.instruction.fresh_states
+    if demonstrations >= wanted:
+        return None
+    simulator = open_world(options).simulator(min(wanted, STATES_AT_ONCE))
+    frames = [simulator.reset()[PIXELS] for _ in range(math.ceil(wanted / STATES_AT_ONCE))]
+    return torch.cat(frames)[:wanted]
 
 
 @recipe_main

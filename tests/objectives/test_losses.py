@@ -12,7 +12,7 @@ from torch.distributions import Categorical
 from torchrl.modules import OneHotCategorical, ProbabilisticActor
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import Shapes, make_instruction_classifier
+from ifo_grounding.networks import Shapes, WordMaps, make_instruction_classifier
 from ifo_grounding.objectives import (
     GoalLoss,
     ImitationLoss,
@@ -134,6 +134,62 @@ def test_the_contrast_is_the_cross_entropy_of_the_own_instruction_by_hand():
     rest = InstructionLoss(network, pool, negatives=1, removal_rate=0.5)
     added = half(data)["loss_instruction"] - rest(data)["loss_instruction"]
     assert added.item() == pytest.approx(first / 2, rel=1e-5)
+
+
+def test_an_instruction_is_told_apart_from_itself_in_fresh_states_by_hand():
+    pool = torch.tensor([[1, 0], [2, 0]])
+    data = TensorDict({"pixels": torch.zeros(2, 1), "instruction": pool}, [2])
+    states = torch.zeros(3, 1, 1, 1, dtype=torch.uint8)
+    options = {"negatives": 1, "removal_rate": 0.0, "states": states, "fresh": 2}
+    network = suitability([0.9, 0.6])  # whatever the image
+    out = InstructionLoss(network, pool, **options)(data)
+    positives = -(math.log(0.9) + math.log(0.6)) / 2
+    # Each has three negatives: the other instruction here, and itself elsewhere, twice.
+    negatives = -(math.log(0.1) * 3 + math.log(0.4) * 3) / 6
+    assert out["loss_instruction"].item() == pytest.approx((positives + negatives) / 2, rel=1e-5)
+    contrasted = InstructionLoss(network, pool, contrast=1.0, **options)(data)
+    odds = 9.0, 1.5
+    here = (math.log(1 + odds[1] / odds[0]) + math.log(1 + odds[0] / odds[1])) / 2
+    added = contrasted["loss_instruction"] - out["loss_instruction"]
+    assert added.item() == pytest.approx(here + math.log(3), rel=1e-5)
+
+
+@pytest.mark.parametrize("preset", ["strong", "film", "paper"])
+def test_pairs_with_fresh_states_are_scored_as_any_pairs(preset):
+    states = torch.randint(256, (5, 3, 24, 24), dtype=torch.uint8)
+    source = torch.Generator().manual_seed(1)
+    loss = make_loss("instruction", preset, states=states, fresh=4, generator=source).eval()
+    data = batch()
+    scores = loss._elsewhere(data)
+    drawn = torch.randint(5, (4,), generator=torch.Generator().manual_seed(1))
+    rows = torch.cartesian_prod(torch.arange(12), drawn)
+    pairs = {"pixels": states[rows[:, 1]], "instruction": data["instruction"][rows[:, 0]]}
+    expected = loss.network(TensorDict(pairs, [48]))["suitability"].view(12, 4)
+    torch.testing.assert_close(scores, expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_words_are_swapped_only_where_the_instruction_module_is_to_be_strict(strict):
+    loss = make_loss("instruction", "strong", strict=strict)
+    words = next(part for part in loss.modules() if isinstance(part, WordMaps)).train()
+    words.noise = 0.0
+    tokens = POOL[torch.arange(8) % 4]
+    with torch.no_grad():
+        heard = [words.roles(tokens)[0] for _ in range(2)]
+    assert torch.equal(*heard) != strict
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"states": torch.zeros(3, 24, 24)}, r"states must be images \[S, C, H, W\]"),
+        ({"states": torch.zeros(0, 3, 24, 24)}, r"states must be images"),
+        ({"fresh": 0}, "fresh must be at least 1, got 0"),
+    ],
+)
+def test_impossible_fresh_states_are_refused(options, message):
+    with pytest.raises(UserError, match=message):
+        make_loss("instruction", **options)
 
 
 def test_the_likeliest_negatives_are_removed_after_the_warm_up():

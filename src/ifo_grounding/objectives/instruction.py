@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.modules import set_lenient
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import (
     ESTIMATED,
@@ -41,6 +42,10 @@ class InstructionLoss(SupervisedLoss):
     the best possible classifier says 0.69 where the paper's threshold is 0.8. In large pools false
     negatives are rare. So the share to remove is estimated, unless it is given.
 
+    Few demonstrations show few scenes, and what suits these is soon known by heart. With ``states``
+    each demonstration's scene is also told apart from fresh states of the simulator, given its own
+    instruction: further pairs of which few are suitable, in scenes without end. An extension.
+
     Args:
         network: an image and an instruction to a logit, as ``make_instruction_classifier`` builds.
         pool: token ids [P, L] of the instructions of the demonstrations.
@@ -56,10 +61,16 @@ class InstructionLoss(SupervisedLoss):
             2017, with both classes weighing the same). ``"mixture"`` drops none either:
             :meth:`calibrate` then counts how many suitable ones they hold (Elkan and Noto 2008).
         near: share of the negatives that differ from the own instruction in few words.
+        states: images of fresh states of the simulator, uint8 [S, C, H, W].
+        fresh: how many of these, drawn anew for each batch, every instruction of it is scored with.
+        strict: whether words are swapped for others in training where the network reads word by
+            word (``"strong"``), so that what they count for cannot depend on which they are: for
+            combinations that no demonstration names. It takes many demonstrations to learn so.
         generator: where random numbers come from; None is the global generator.
 
     Raises:
-        UserError: for a pool of fewer than two different instructions, or values out of range.
+        UserError: for a pool of fewer than two different instructions, states that are no images,
+            or values out of range.
 
     >>> from ifo_grounding.networks import Shapes, make_instruction_classifier
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
@@ -70,6 +81,8 @@ class InstructionLoss(SupervisedLoss):
     >>> round(float(losses["removed"]), 2)
     0.28
     """
+
+    states: Tensor | None
 
     @dataclass
     class _AcceptedKeys:
@@ -94,6 +107,9 @@ class InstructionLoss(SupervisedLoss):
         contrast: float = 0.0,
         unlabelled: str = "removal",
         near: float = 0.0,
+        states: Tensor | None = None,
+        fresh: int = 32,
+        strict: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
@@ -101,10 +117,17 @@ class InstructionLoss(SupervisedLoss):
             raise UserError(f"negatives must be at least 1, got {negatives}")
         if contrast < 0:
             raise UserError(f"contrast is a weight of at least 0, got {contrast}")
+        if fresh < 1:
+            raise UserError(f"fresh must be at least 1, got {fresh}")
+        if states is not None and (states.ndim != 4 or not len(states)):
+            raise UserError(f"states must be images [S, C, H, W], got shape {list(states.shape)}")
         check_choice("treatment of unlabelled pairs", unlabelled, UNLABELLED)
         self.contrast, self.unlabelled = contrast, unlabelled
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator, near)
         self.count = min(negatives, len(self.negatives.pool) - 1)
+        self.fresh = fresh
+        set_lenient(network, not strict)
+        self.register_buffer("states", states, persistent=False)
 
     def set_progress(self, fraction: float) -> None:
         """Say which share of training is done, in [0, 1]; until told, training counts as late."""
@@ -141,6 +164,8 @@ class InstructionLoss(SupervisedLoss):
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
             own, other = pair_scores(self.network, batch, others)
+            if self.states is not None:
+                other = torch.cat([other, self._elsewhere(batch)], 1)
         if self.training:
             self.negatives.watch(own, other)
         if self.unlabelled == "removal":
@@ -152,14 +177,26 @@ class InstructionLoss(SupervisedLoss):
             refused = F.softplus(other).mean() if mixture else self._non_negative(own, other)
         loss = (F.softplus(-own).mean() + refused) / 2
         if self.contrast:
-            logits = torch.cat([own.unsqueeze(1), other.masked_fill(~kept, -torch.inf)], 1)
-            loss = loss + self.contrast * (logits.logsumexp(1) - own).mean()
+            told = other.masked_fill(~kept, -torch.inf)
+            for rivals in told.split([self.count, told.shape[1] - self.count], 1):
+                logits = torch.cat([own.unsqueeze(1), rivals], 1)
+                loss = loss + self.contrast * (logits.logsumexp(1) - own).mean()
         return scalars(
             loss_instruction=loss,
             positive_probability=self._mean(own.sigmoid()),
             negative_probability=self._mean(other.sigmoid()),
             removed=1 - self._mean(kept),
         )
+
+    def _elsewhere(self, batch: TensorDictBase) -> Tensor:
+        """Score each row's own instruction in some fresh states: logits [N, fresh]."""
+        assert self.states is not None
+        image, instruction = self.network.in_keys
+        spoken = batch.get(instruction).expand(self.fresh, -1, -1)
+        rows = self.negatives.randint(0, len(self.states), (self.fresh,))
+        scenes = TensorDict({image: self.states[rows], instruction: spoken[:, 0]}, [self.fresh])
+        first, others = pair_scores(self.network, scenes, spoken[:, 1:])
+        return torch.cat([first.unsqueeze(1), others], 1).T
 
     def _non_negative(self, own: Tensor, other: Tensor) -> Tensor:
         """Estimate the loss of true negatives from that of unlabelled pairs and of positives."""

@@ -103,8 +103,8 @@ class NegativeInstructions(nn.Module):
         """
         size = len(self.pool)
         shape = (len(instruction), count)
-        index = self._randint(0, size, shape)
-        moved = (index + self._randint(1, size, shape)) % size
+        index = self.randint(0, size, shape)
+        moved = (index + self.randint(1, size, shape)) % size
         same = (self.pool[index] == instruction.unsqueeze(1)).all(-1)
         return self.pool[torch.where(same, moved, index)]
 
@@ -113,7 +113,7 @@ class NegativeInstructions(nn.Module):
         differing = torch.stack([(self.pool != row).sum(-1) for row in instruction])
         differing = torch.where(differing == 0, self.pool.shape[1] + 1, differing)
         nearest = differing.topk(min(NEAREST, len(self.pool) - 1), largest=False).indices
-        chosen = self._randint(0, nearest.shape[1], (len(instruction), count))
+        chosen = self.randint(0, nearest.shape[1], (len(instruction), count))
         return self.pool[nearest.gather(1, chosen)]
 
     def watch(self, own: Tensor, other: Tensor) -> None:
@@ -166,7 +166,8 @@ class NegativeInstructions(nn.Module):
         mask[scores.detach().flatten().topk(drop).indices] = False
         return mask.reshape(scores.shape)
 
-    def _randint(self, low: int, high: int, shape: tuple[int, int]) -> Tensor:
+    def randint(self, low: int, high: int, shape: tuple[int, ...]) -> Tensor:
+        """Draw integers from ``low`` up to ``high``, which is left out."""
         device = self.pool.device if self.generator is None else self.generator.device
         numbers = torch.randint(low, high, shape, generator=self.generator, device=device)
         return numbers.to(self.pool.device)
