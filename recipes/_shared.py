@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,9 +17,10 @@ from torchrl.data import ReplayBuffer
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
-from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
+from ifo_grounding.objectives import SupervisedLoss
+from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
-from ifo_grounding.training.supervised import Validation
+from ifo_grounding.training.supervised import Metrics, Validation
 
 torchrl_logger.setLevel("WARNING")
 
@@ -132,6 +134,48 @@ def train(
         finish()
     networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
     return stage.finish({**history[-1], **found}, history)
+
+
+class Beginning:
+    """One of several ways to begin learning, of which the best one after a few steps goes on."""
+
+    def __init__(
+        self,
+        options: DictConfig,
+        stage: Stage,
+        section: str,
+        loss: SupervisedLoss,
+        seen: ReplayBuffer,
+        number: int,
+        held_out: ReplayBuffer | None = None,
+    ) -> None:
+        self.options, self.stage, self.section = options, stage, section
+        self.loss, self.seen, self.number = loss, seen, number
+        self.validation = HeldOut(loss, held_out) if held_out is not None else None
+        self.checkpoint = stage.checkpoint.with_stem(f"{stage.checkpoint.stem}-{number}")
+
+    def try_out(self) -> float:
+        """Learn for a few steps, leave a checkpoint to go on from, and return the loss."""
+        section = self.options[self.section]
+        history = self.learn(until=section.trial_steps)
+        iteration = fit_config(section).iteration
+        return history[: math.ceil(section.trial_steps / iteration)][-1][self.loss.out_keys[0]]
+
+    def learn(self, until: int | None = None) -> list[Metrics]:
+        """Learn on from the checkpoint, up to some step or to the end."""
+        return fit(
+            self.loss,
+            self.seen,
+            fit_config(self.options[self.section]),
+            seed=self.options.seed,
+            name=self.stage.name,
+            checkpoint=self.checkpoint,
+            checkpoint_seconds=self.options.checkpoint_seconds,
+            held_out=self.validation,
+            progress=shows_progress(self.options),
+            settings=self.stage.settings,
+            until=until,
+        )
 
 
 def fit_config(section: DictConfig) -> FitConfig:

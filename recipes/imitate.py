@@ -1,15 +1,13 @@
 """Imitate the labelled demonstrations: phase 1, which is BCO (paper, 1st-phase)."""
 
-import math
 from collections.abc import Callable
 
 from _shared import (
     POLICIES,
-    fit_config,
+    Beginning,
     load_demonstrations,
     load_labels,
     open_stage,
-    shows_progress,
     train,
 )
 from _worlds import build, context_of
@@ -22,8 +20,7 @@ from ifo_grounding.data import Demonstrations, labelled_buffer
 from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.seeding import derive
-from ifo_grounding.training import HeldOut, Run, Stage, fit
-from ifo_grounding.training.supervised import Metrics
+from ifo_grounding.training import Run, Stage
 
 
 def imitate(options: DictConfig) -> dict:
@@ -63,48 +60,6 @@ def imitation(options: DictConfig, seed: int) -> ImitationLoss:
     return ImitationLoss(policy, strict_from=options.imitate.get("strict_from", 0.0))
 
 
-class Beginning:
-    """One of the initial weights that are tried: some take many times longer to ground a word."""
-
-    def __init__(
-        self,
-        options: DictConfig,
-        stage: Stage,
-        seen: ReplayBuffer,
-        held_out: ReplayBuffer | None,
-        number: int,
-        imitation: Callable[[DictConfig, int], ImitationLoss],
-    ) -> None:
-        self.options, self.stage, self.seen, self.number = options, stage, seen, number
-        seed = derive(options.seed, "beginning", number) if number else options.seed
-        self.loss = imitation(options, seed)
-        self.validation = HeldOut(self.loss, held_out) if held_out is not None else None
-        self.checkpoint = stage.checkpoint.with_stem(f"{stage.checkpoint.stem}-{number}")
-
-    def try_out(self) -> float:
-        """Learn for a few steps, leave a checkpoint to go on from, and return the loss."""
-        steps = self.options.imitate.trial_steps
-        history = self.learn(until=steps)
-        iteration = fit_config(self.options.imitate).iteration
-        return history[: math.ceil(steps / iteration)][-1]["loss_imitation"]
-
-    def learn(self, until: int | None = None) -> list[Metrics]:
-        """Learn on from the checkpoint, up to some step or to the end."""
-        return fit(
-            self.loss,
-            self.seen,
-            fit_config(self.options.imitate),
-            seed=self.options.seed,
-            name=self.stage.name,
-            checkpoint=self.checkpoint,
-            checkpoint_seconds=self.options.checkpoint_seconds,
-            held_out=self.validation,
-            progress=shows_progress(self.options),
-            settings=self.stage.settings,
-            until=until,
-        )
-
-
 def best_beginning(
     options: DictConfig,
     stage: Stage,
@@ -113,10 +68,13 @@ def best_beginning(
     imitation: Callable[[DictConfig, int], ImitationLoss] = imitation,
 ) -> Beginning:
     """Try a few initial weights, and return those that imitate best so far."""
-    beginnings = [
-        Beginning(options, stage, seen, held_out, number, imitation)
-        for number in range(options.imitate.trials)
-    ]
+
+    def beginning(number: int) -> Beginning:
+        seed = derive(options.seed, "beginning", number) if number else options.seed
+        loss = imitation(options, seed)
+        return Beginning(options, stage, "imitate", loss, seen, number, held_out)
+
+    beginnings = [beginning(number) for number in range(options.imitate.trials)]
     return min(beginnings, key=lambda beginning: beginning.try_out())
 
 

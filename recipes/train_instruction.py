@@ -5,6 +5,7 @@ import math
 import torch
 from _shared import (
     CLASSIFIER,
+    Beginning,
     load_demonstrations,
     open_stage,
     starting_policy,
@@ -15,12 +16,14 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.data import first_frame_buffer
+from ifo_grounding.data import Demonstrations, first_frame_buffer
 from ifo_grounding.keys import PIXELS
 from ifo_grounding.networks import make_instruction_classifier
 from ifo_grounding.objectives import InstructionLoss
+from ifo_grounding.training import Run
 
 STATES_AT_ONCE = 256
+CLEARLY = 0.9
 
 
 def train_instruction(options: DictConfig) -> dict:
@@ -32,23 +35,59 @@ def train_instruction(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
-    policy = starting_policy(stage.run, options, "instruction")
-    context = context_of(options, "imitate") if policy is not None else 0
-    loss = InstructionLoss(
-        build(make_instruction_classifier, options, init_from=policy, context=context),
-        demos.pool(),
-        negatives=options.instruction.negatives,
-        removal_rate=options.instruction.removal_rate,
-        warmup=options.instruction.removal_warmup,
-        contrast=options.instruction.contrast,
-        unlabelled=options.instruction.unlabelled,
-        near=options.instruction.near,
-        states=fresh_states(options, len(demos)),
-        strict=options.instruction.strict,
+    states = fresh_states(options, len(demos))
+    seen = first_frame_buffer(demos)
+    beginnings = [
+        Beginning(options, stage, "instruction", loss, seen, number)
+        for number, loss in enumerate(losses(options, stage.run, demos, states))
+    ]
+    best = clearly_best(*beginnings) if len(beginnings) > 1 else beginnings[0]
+    return train(
+        options,
+        stage,
+        best.loss,
+        seen,
+        "instruction",
+        CLASSIFIER,
+        finish=best.loss.calibrate if options.instruction.removal_rate == "estimated" else None,
+        checkpoint=best.checkpoint,
+        beginning=float(best.number),
     )
-    calibrate = loss.calibrate if options.instruction.removal_rate == "estimated" else None
-    buffer = first_frame_buffer(demos)
-    return train(options, stage, loss, buffer, "instruction", CLASSIFIER, finish=calibrate)
+
+
+def losses(
+    options: DictConfig, run: Run, demos: Demonstrations, states: Tensor | None
+) -> list[InstructionLoss]:
+    """Return a loss for each way to begin: with the policy's roles of words, or without."""
+    section = options.instruction
+    policy = starting_policy(run, options, "instruction")
+    given = {}
+    if policy is not None:
+        given = {"init_from": policy, "context": context_of(options, "imitate")}
+    return [
+        InstructionLoss(
+            build(make_instruction_classifier, options, roles=roles, **given),
+            demos.pool(),
+            negatives=section.negatives,
+            removal_rate=section.removal_rate,
+            warmup=section.removal_warmup,
+            contrast=section.contrast,
+            unlabelled=section.unlabelled,
+            near=section.near,
+            states=states,
+            strict=section.strict,
+        )
+        for roles in ([True, False] if section.trials > 1 else [False])
+    ]
+
+
+def clearly_best(first: Beginning, *others: Beginning) -> Beginning:
+    """Try beginnings out, and return the first unless another is better by a tenth."""
+    best, least = first, CLEARLY * first.try_out()
+    for other in others:
+        if (loss := other.try_out()) < least:
+            best, least = other, loss
+    return best
 
 
 def fresh_states(options: DictConfig, demonstrations: int) -> Tensor | None:

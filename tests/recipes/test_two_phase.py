@@ -154,6 +154,53 @@ def test_every_recipe_has_options_that_begin_with_its_command(recipes):
         assert Path(script).read_text().startswith('"""')
 
 
+@pytest.mark.parametrize(("losses", "number"), [((1.0, 0.95), 0), ((1.0, 0.6, 0.7), 1)])
+def test_another_beginning_goes_on_only_where_it_is_clearly_better(recipes, losses, number):
+    from train_instruction import clearly_best
+
+    class Tried:
+        def __init__(self, loss):
+            self.loss = loss
+
+        def try_out(self):
+            return self.loss
+
+    tried = [Tried(loss) for loss in losses]
+    assert clearly_best(*tried) is tried[number]
+
+
+def test_the_instruction_module_tries_the_policys_roles_and_sees_fresh_states(compose):
+    from _shared import load_demonstrations, load_network, open_run
+    from collect_transitions import collect
+    from imitate import imitate
+    from label import label
+    from record_demonstrations import record
+    from train_instruction import fresh_states, losses, train_instruction
+    from train_inverse import train_inverse
+
+    options = compose("train_instruction", "task=pick", "instruction.fresh_states=301")
+    for stage in (record, collect, train_inverse, label, imitate):
+        stage(options)
+    assert train_instruction(options)["beginning"] in (0.0, 1.0)
+
+    run = open_run(options)
+    policy = load_network(run, "policy-phase1.safetensors", "imitate", options)
+    tried = losses(options, run, load_demonstrations(run), None)
+    theirs, *own = (
+        next(part for part in each.modules() if isinstance(part, networks.WordMaps))
+        for each in (policy, *tried)
+    )
+    for part, kept in (("about_form.weight", [True, True]), ("role.weight", [True, False])):
+        weight = theirs.state_dict()[part]
+        assert [torch.equal(words.state_dict()[part], weight) for words in own] == kept
+
+    assert fresh_states(options, 301) is None
+    states = fresh_states(options, 300)
+    assert states.shape == (301, 3, 48, 48)
+    assert len(states.flatten(1).unique(dim=0)) == 301
+    assert torch.equal(states, fresh_states(options, 300))
+
+
 @pytest.mark.parametrize(("preset", "schedule"), [("paper", "constant"), ("film", "cosine")])
 def test_the_papers_learning_rate_does_not_decay(compose, preset, schedule):
     from _shared import fit_config

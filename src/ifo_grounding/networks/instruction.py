@@ -33,12 +33,14 @@ def pair_scorer(shapes: Shapes, config: NetworkConfig, images: int = 1) -> PairS
     return kind(shapes, config, images)
 
 
-def begin_with_policy(network: PairScorer, policy: nn.Module, plan: Blueprint) -> None:
+def begin_with_policy(
+    network: PairScorer, policy: nn.Module, plan: Blueprint, roles: bool = False
+) -> None:
     """Copy what a policy has learned of words, cells and places; of several images, to the last.
 
     Of words that are read one by one that is what they look like and which side they name. Which
-    of them count for which map is learned anew: a policy may hear object and target in one map,
-    one after the other, which tells nobody whether both are there.
+    of them count for which map is learned anew, unless ``roles`` says otherwise: a policy may hear
+    object and target in one map, one after the other, which tells nobody whether both are there.
 
     Raises:
         UserError: where the weights do not fit.
@@ -51,9 +53,10 @@ def begin_with_policy(network: PairScorer, policy: nn.Module, plan: Blueprint) -
         )
     if isinstance(trunk, GroundedTrunk):
         assert isinstance(network, WordScorer)
+        words = [(getattr(trunk.words, part), getattr(network.words, part)) for part in MEANING]
         parts: list[tuple[nn.Module, nn.Module]] = [
             (trunk.looks, network.looks),
-            *((getattr(trunk.words, part), getattr(network.words, part)) for part in MEANING),
+            *([(trunk.words, network.words)] if roles else words),
         ]
         widened: list[tuple[nn.Module, nn.Module]] = [
             (trunk.attention, network.attention),
@@ -79,6 +82,7 @@ def make_instruction_classifier(
     in_keys: Sequence[NestedKey] = (keys.PIXELS, keys.INSTRUCTION),
     out_key: NestedKey = keys.SUITABILITY,
     init_from: nn.Module | None = None,
+    roles: bool = False,
     device: torch.device | str | None = None,
     seed: int | None = None,
     **overrides: Any,
@@ -96,6 +100,9 @@ def make_instruction_classifier(
         init_from: a policy of the same preset and sizes whose weights it begins with. It has
             learned what the words look like, which first frames alone teach slowly (an extension
             of the paper).
+        roles: whether it also begins with which words count for which map of that policy, where it
+            reads word by word (``"strong"``). Most policies know; one that finds object and target
+            by one map, one after the other, does not.
         device: where to build it.
         seed: makes the initial weights a function of the seed alone.
         overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
@@ -116,5 +123,5 @@ def make_instruction_classifier(
     plan = blueprint("instruction", spec_source, preset, options, overrides)
     network = construct(pair_scorer, plan, device, seed)
     if init_from is not None:
-        begin_with_policy(network, init_from, plan)
+        begin_with_policy(network, init_from, plan, roles)
     return wrap(network, plan, in_keys, [out_key])
