@@ -26,6 +26,10 @@ class NothingSuitableError(UserError, RuntimeError):
     """No instruction of the pool suited any state that the simulator drew."""
 
 
+HOPELESS = 100
+"""States in a row that may be drawn for one row while none has ever been served."""
+
+
 class InstructionSampler(InstructionTransform):
     """Gives every new episode an instruction that a classifier finds suitable.
 
@@ -45,7 +49,8 @@ class InstructionSampler(InstructionTransform):
         candidates: instructions drawn for each state; the whole pool if it is smaller.
         choose: ``random`` among the suitable ones (then only as many are scored as it takes to find
             one), or the ``best``.
-        max_tries: states drawn for one row before giving up.
+        max_tries: states drawn for one row before giving up; no more than 100 while no state has
+            ever been served.
         seed: seed of the choices.
         in_keys: key of the image.
         out_keys: key of the instruction.
@@ -55,7 +60,7 @@ class InstructionSampler(InstructionTransform):
     Raises:
         UserError: on an option or a pool of another form, on an environment that exposes its true
             state or already has an instruction.
-        NothingSuitableError: where a row finds no instruction within ``max_tries`` states.
+        NothingSuitableError: where a row finds no instruction within so many states.
 
     >>> from tensordict.nn import TensorDictModule
     >>> from torchrl.envs import TransformedEnv
@@ -79,7 +84,7 @@ class InstructionSampler(InstructionTransform):
         threshold: float = 0.8,
         candidates: int = 64,
         choose: str = "random",
-        max_tries: int = 100,
+        max_tries: int = 1000,
         seed: int = 0,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
@@ -90,6 +95,7 @@ class InstructionSampler(InstructionTransform):
         if max_tries < 1:
             raise UserError(f"max_tries must be at least 1, got {max_tries}")
         self.threshold, self.candidates, self.choose = threshold, candidates, choose
+        self._hopeful = False  # whether any state has ever been served
         self.max_tries, self.vocabulary_size = max_tries, vocabulary_size
         distinct = check_pool(pool).unique(dim=0)
         self.scorer = PoolScorer(classifier, distinct, self.in_keys[0])
@@ -151,6 +157,7 @@ class InstructionSampler(InstructionTransform):
         )
         self._drawn += len(index)
         self._served += int((index >= 0).sum())
+        self._hopeful |= bool(self._served)
         self._score_sum += float(score[index >= 0].sum())
         return index, score
 
@@ -162,10 +169,10 @@ class InstructionSampler(InstructionTransform):
         waiting = self.beginning(tensordict, rows)
         pixels = tensordict_reset.get(self.in_keys[0])
         instruction = self.pool.new_zeros(rows, self.pool.shape[1], device=pixels.device)
-        best_score = 0.0
-        for attempt in range(self.max_tries):
-            if not len(waiting):
-                break
+        best_score, attempt = 0.0, 0
+        while len(waiting) and attempt < (
+            self.max_tries if self._hopeful else min(self.max_tries, HOPELESS)
+        ):
             if attempt:
                 tensordict_reset = self._draw_again(tensordict_reset, waiting)
             pixels = tensordict_reset.get(self.in_keys[0])
@@ -174,16 +181,17 @@ class InstructionSampler(InstructionTransform):
             found = index >= 0
             instruction[waiting[found]] = self.pool.to(pixels.device)[index[found]]
             waiting = waiting[~found]
+            attempt += 1
             best_score = max(best_score, float(score.max()))
         if len(waiting):
-            raise NothingSuitableError(self._complaint(len(waiting), best_score))
+            raise NothingSuitableError(self._complaint(len(waiting), attempt, best_score))
         tensordict_reset.set(self.out_keys[0], instruction.reshape(*batch, -1))
         return tensordict_reset
 
-    def _complaint(self, waiting: int, best_score: float) -> str:
+    def _complaint(self, waiting: int, tries: int, best_score: float) -> str:
         return (
             f"no instruction of the pool scored above {self.threshold} on any of "
-            f"{self.max_tries} states in {waiting} of the rows (best score seen in this reset: "
+            f"{tries} states in {waiting} of the rows (best score seen in this reset: "
             f"{best_score:.2f}; {self._served} of {self._drawn} states served so far): lower "
             "threshold, raise candidates or max_tries, or train the classifier longer"
         )
