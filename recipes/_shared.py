@@ -117,7 +117,26 @@ def train(
     **found: float,
 ) -> dict:
     """Fit a network to a buffer, do what is left to do, save it, and finish with what was found."""
-    history = fit(
+    history = learn(
+        options, stage, loss, buffer, section, checkpoint, held_out=held_out, log=stage.log()
+    )
+    if finish is not None:
+        finish()
+    networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
+    return stage.finish({**history[-1], **found}, history)
+
+
+def learn(
+    options: DictConfig,
+    stage: Stage,
+    loss: nn.Module,
+    buffer: ReplayBuffer,
+    section: str,
+    checkpoint: Path | None = None,
+    **kwargs: Any,
+) -> list[Metrics]:
+    """Learn on from a checkpoint as a section of the options says."""
+    return fit(
         loss,
         buffer,
         fit_config(options[section]),
@@ -125,15 +144,10 @@ def train(
         name=stage.name,
         checkpoint=checkpoint or stage.checkpoint,
         checkpoint_seconds=options.checkpoint_seconds,
-        log=stage.log(),
-        held_out=held_out,
         progress=shows_progress(options),
         settings=stage.settings,
+        **kwargs,
     )
-    if finish is not None:
-        finish()
-    networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
-    return stage.finish({**history[-1], **found}, history)
 
 
 class Beginning:
@@ -163,19 +177,22 @@ class Beginning:
 
     def learn(self, until: int | None = None) -> list[Metrics]:
         """Learn on from the checkpoint, up to some step or to the end."""
-        return fit(
-            self.loss,
-            self.seen,
-            fit_config(self.options[self.section]),
-            seed=self.options.seed,
-            name=self.stage.name,
-            checkpoint=self.checkpoint,
-            checkpoint_seconds=self.options.checkpoint_seconds,
+        return learn(*self._what, self.checkpoint, held_out=self.validation, until=until)
+
+    def train(self, file: str, finish: Callable[[], Any] | None = None) -> dict:
+        """Learn on to the end, and save the network."""
+        return train(
+            *self._what,
+            file,
             held_out=self.validation,
-            progress=shows_progress(self.options),
-            settings=self.stage.settings,
-            until=until,
+            finish=finish,
+            checkpoint=self.checkpoint,
+            beginning=float(self.number),
         )
+
+    @property
+    def _what(self) -> tuple[DictConfig, Stage, SupervisedLoss, ReplayBuffer, str]:
+        return self.options, self.stage, self.loss, self.seen, self.section
 
 
 def fit_config(section: DictConfig) -> FitConfig:

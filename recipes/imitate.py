@@ -8,7 +8,6 @@ from _shared import (
     load_demonstrations,
     load_labels,
     open_stage,
-    train,
 )
 from _worlds import build, context_of
 from omegaconf import DictConfig
@@ -39,18 +38,7 @@ def imitate_transitions(
     file: str,
 ) -> dict:
     """Imitate transitions with their actions, from the best of a few initial weights."""
-    best = best_beginning(options, stage, seen, held_out)
-    return train(
-        options,
-        stage,
-        best.loss,
-        seen,
-        "imitate",
-        file,
-        held_out=best.validation,
-        checkpoint=best.checkpoint,
-        beginning=float(best.number),
-    )
+    return best_beginning(options, stage, seen, held_out).train(file)
 
 
 def imitation(options: DictConfig, seed: int) -> ImitationLoss:

@@ -9,7 +9,6 @@ from _shared import (
     load_demonstrations,
     open_stage,
     starting_policy,
-    train,
 )
 from _worlds import build, context_of, open_world
 from omegaconf import DictConfig
@@ -41,18 +40,9 @@ def train_instruction(options: DictConfig) -> dict:
         Beginning(options, stage, "instruction", loss, seen, number)
         for number, loss in enumerate(losses(options, stage.run, demos, states))
     ]
-    best = clearly_best(*beginnings) if len(beginnings) > 1 else beginnings[0]
-    return train(
-        options,
-        stage,
-        best.loss,
-        seen,
-        "instruction",
-        CLASSIFIER,
-        finish=best.loss.calibrate if options.instruction.removal_rate == "estimated" else None,
-        checkpoint=best.checkpoint,
-        beginning=float(best.number),
-    )
+    best = clearly_best(*beginnings)
+    estimated = options.instruction.removal_rate == "estimated"
+    return best.train(CLASSIFIER, finish=best.loss.calibrate if estimated else None)
 
 
 def losses(
@@ -61,12 +51,16 @@ def losses(
     """Return a loss for each way to begin: with the policy's roles of words, or without."""
     section = options.instruction
     policy = starting_policy(run, options, "instruction")
-    given = {}
-    if policy is not None:
-        given = {"init_from": policy, "context": context_of(options, "imitate")}
+    context = context_of(options, "imitate") if policy is not None else 0
     return [
         InstructionLoss(
-            build(make_instruction_classifier, options, roles=roles, **given),
+            build(
+                make_instruction_classifier,
+                options,
+                init_from=policy,
+                roles=roles,
+                context=context,
+            ),
             demos.pool(),
             negatives=section.negatives,
             removal_rate=section.removal_rate,
@@ -83,6 +77,8 @@ def losses(
 
 def clearly_best(first: Beginning, *others: Beginning) -> Beginning:
     """Try beginnings out, and return the first unless another is better by a tenth."""
+    if not others:
+        return first
     best, least = first, CLEARLY * first.try_out()
     for other in others:
         if (loss := other.try_out()) < least:

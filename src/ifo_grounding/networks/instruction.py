@@ -53,11 +53,13 @@ def begin_with_policy(
         )
     if isinstance(trunk, GroundedTrunk):
         assert isinstance(network, WordScorer)
-        words = [(getattr(trunk.words, part), getattr(network.words, part)) for part in MEANING]
-        parts: list[tuple[nn.Module, nn.Module]] = [
-            (trunk.looks, network.looks),
-            *([(trunk.words, network.words)] if roles else words),
-        ]
+        parts: list[tuple[nn.Module, nn.Module]] = [(trunk.looks, network.looks)]
+        if roles:
+            parts.append((trunk.words, network.words))
+        else:
+            parts += [
+                (getattr(trunk.words, part), getattr(network.words, part)) for part in MEANING
+            ]
         widened: list[tuple[nn.Module, nn.Module]] = [
             (trunk.attention, network.attention),
             (trunk.value, network.value),

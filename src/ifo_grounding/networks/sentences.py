@@ -148,7 +148,8 @@ class GRUInstructionEncoder(InstructionEncoder):
         self.rate = rate
         check_choice("pooling", pooling, POOLINGS)
         self.pooling = pooling
-        self.size = (4 if pooling == "both" else 2) * hidden
+        if pooling == "both":
+            self.size *= 2
         self.input_weight = nn.Parameter(torch.empty(2, embedding, 3 * hidden))
         self.input_bias = nn.Parameter(torch.zeros(2, 1, 3 * hidden))
         self.state_weight = nn.Parameter(torch.empty(2, hidden, 3 * hidden))

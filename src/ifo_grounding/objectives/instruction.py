@@ -178,7 +178,8 @@ class InstructionLoss(SupervisedLoss):
         loss = (F.softplus(-own).mean() + refused) / 2
         if self.contrast:
             told = other.masked_fill(~kept, -torch.inf)
-            for rivals in told.split([self.count, told.shape[1] - self.count], 1):
+            kinds = [self.count] if self.states is None else [self.count, self.fresh]
+            for rivals in told.split(kinds, 1):
                 logits = torch.cat([own.unsqueeze(1), rivals], 1)
                 loss = loss + self.contrast * (logits.logsumexp(1) - own).mean()
         return scalars(

@@ -170,9 +170,7 @@ class InstructionSampler(InstructionTransform):
         pixels = tensordict_reset.get(self.in_keys[0])
         instruction = self.pool.new_zeros(rows, self.pool.shape[1], device=pixels.device)
         best_score, attempt = 0.0, 0
-        while len(waiting) and attempt < (
-            self.max_tries if self._hopeful else min(self.max_tries, HOPELESS)
-        ):
+        while len(waiting) and attempt < self._patience():
             if attempt:
                 tensordict_reset = self._draw_again(tensordict_reset, waiting)
             pixels = tensordict_reset.get(self.in_keys[0])
@@ -187,6 +185,10 @@ class InstructionSampler(InstructionTransform):
             raise NothingSuitableError(self._complaint(len(waiting), attempt, best_score))
         tensordict_reset.set(self.out_keys[0], instruction.reshape(*batch, -1))
         return tensordict_reset
+
+    def _patience(self) -> int:
+        """Return how many states may be drawn for one row by now."""
+        return self.max_tries if self._hopeful else min(self.max_tries, HOPELESS)
 
     def _complaint(self, waiting: int, tries: int, best_score: float) -> str:
         return (
