@@ -49,6 +49,10 @@ class WordScorer(PairScorer):
     :class:`~ifo_grounding.networks.GroundedTrunk`, what lies around these places, whether there is
     one of them, and how many cells fit.
 
+    A policy asks where the evidence for a word is greatest; a judge, whether it is enough. What is
+    enough differs from word to word, so that each has a threshold of its own. It shifts what is
+    said of all cells alike, which leaves the places as they are and moves the counts.
+
     Args:
         shapes: sizes of inputs.
         config: sizes of the network.
@@ -69,6 +73,7 @@ class WordScorer(PairScorer):
         self.around = nn.Conv2d(FORMS, AROUND, 3, padding=1)
         self.register_buffer("place", cell_places(grid(shapes, config)), persistent=False)
         self.known = shapes.vocabulary_size
+        self.threshold = nn.Parameter(torch.zeros(shapes.vocabulary_size))
         maps = images * config.maps
         self.scale = nn.Parameter(torch.ones(maps))
         self.bias = nn.Parameter(torch.full((maps,), -4.0))  # most cells do not fit
@@ -92,7 +97,7 @@ class WordScorer(PairScorer):
             colour, form = self.words.evidence(looks)
             silent = F.linear(looks.silhouette, part)
             silent, forms = silent.split([silent.shape[-1] - FORMS, FORMS], -1)
-            tables.append(Seen(colour + form, silent, forms, looks.where))
+            tables.append(Seen(colour + form + self.threshold, silent, forms, looks.where))
         return tables
 
     def _seen(self, tables: list[Seen], cells: list[Tensor]) -> Tensor:
