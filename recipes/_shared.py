@@ -18,6 +18,7 @@ from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
 from ifo_grounding.objectives import SupervisedLoss
+from ifo_grounding.seeding import derive
 from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.training.supervised import Metrics, Validation
@@ -148,6 +149,11 @@ def learn(
         settings=stage.settings,
         **kwargs,
     )
+
+
+def beginning_seed(options: DictConfig, number: int) -> int:
+    """Return the seed of the initial weights of a beginning."""
+    return derive(options.seed, "beginning", number) if number else options.seed
 
 
 class Beginning:

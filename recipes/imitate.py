@@ -5,6 +5,7 @@ from collections.abc import Callable
 from _shared import (
     POLICIES,
     Beginning,
+    beginning_seed,
     load_demonstrations,
     load_labels,
     open_stage,
@@ -18,7 +19,6 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import Demonstrations, labelled_buffer
 from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.seeding import derive
 from ifo_grounding.training import Run, Stage
 
 
@@ -58,8 +58,7 @@ def best_beginning(
     """Try a few initial weights, and return those that imitate best so far."""
 
     def beginning(number: int) -> Beginning:
-        seed = derive(options.seed, "beginning", number) if number else options.seed
-        loss = imitation(options, seed)
+        loss = imitation(options, beginning_seed(options, number))
         return Beginning(options, stage, "imitate", loss, seen, number, held_out)
 
     beginnings = [beginning(number) for number in range(options.imitate.trials)]

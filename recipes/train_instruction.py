@@ -6,6 +6,7 @@ import torch
 from _shared import (
     CLASSIFIER,
     Beginning,
+    beginning_seed,
     load_demonstrations,
     open_stage,
     starting_policy,
@@ -40,7 +41,7 @@ def train_instruction(options: DictConfig) -> dict:
         Beginning(options, stage, "instruction", loss, seen, number)
         for number, loss in enumerate(losses(options, stage.run, demos, states))
     ]
-    best = clearly_best(*beginnings)
+    best = clearly_best(beginnings)
     estimated = options.instruction.removal_rate == "estimated"
     return best.train(CLASSIFIER, finish=best.loss.calibrate if estimated else None)
 
@@ -48,18 +49,20 @@ def train_instruction(options: DictConfig) -> dict:
 def losses(
     options: DictConfig, run: Run, demos: Demonstrations, states: Tensor | None
 ) -> list[InstructionLoss]:
-    """Return a loss for each way to begin: with the policy's roles of words, or without."""
+    """Return a loss for each way to begin: the last one without the policy's roles of words."""
     section = options.instruction
     policy = starting_policy(run, options, "instruction")
     context = context_of(options, "imitate") if policy is not None else 0
+    last = section.trials - 1
     return [
         InstructionLoss(
             build(
                 make_instruction_classifier,
                 options,
                 init_from=policy,
-                roles=roles,
+                roles=number < last,
                 context=context,
+                seed=beginning_seed(options, number % max(last, 1)),
             ),
             demos.pool(),
             negatives=section.negatives,
@@ -71,19 +74,18 @@ def losses(
             states=states,
             strict=section.strict,
         )
-        for roles in ([True, False] if section.trials > 1 else [False])
+        for number in range(section.trials)
     ]
 
 
-def clearly_best(first: Beginning, *others: Beginning) -> Beginning:
-    """Try beginnings out, and return the first unless another is better by a tenth."""
-    if not others:
-        return first
-    best, least = first, CLEARLY * first.try_out()
-    for other in others:
-        if (loss := other.try_out()) < least:
-            best, least = other, loss
-    return best
+def clearly_best(beginnings: list[Beginning]) -> Beginning:
+    """Try beginnings out, and return the best; the last one only if it is better by a tenth."""
+    *likely, last = beginnings
+    if not likely:
+        return last
+    tried = [(beginning.try_out(), beginning) for beginning in likely]
+    least, best = min(tried, key=lambda pair: pair[0])
+    return last if last.try_out() < CLEARLY * least else best
 
 
 def fresh_states(options: DictConfig, demonstrations: int) -> Tensor | None:

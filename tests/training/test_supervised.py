@@ -6,8 +6,9 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import Shapes, make_policy
-from ifo_grounding.objectives import ImitationLoss
+from ifo_grounding.networks import Shapes, make_instruction_classifier, make_policy
+from ifo_grounding.networks.transfer import inherited
+from ifo_grounding.objectives import ImitationLoss, InstructionLoss
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.training.supervised import total_loss
 
@@ -140,6 +141,30 @@ def test_the_prior_counts_for_the_more_the_fewer_the_samples(buffer):
     assert size_of_weights(256, prior=200) < size_of_weights(256, prior=0)
     assert FitConfig(weight_decay=0.5, prior=1).decay(10) == 0.5
     assert FitConfig(prior=1).decay(0) == 1.0
+
+
+def test_what_was_inherited_decays_to_what_it_was(buffer, tmp_path):
+    """And all else to zero, through a pause as well."""
+    policy = make_policy(SHAPES, "strong", seed=0)
+    with torch.no_grad():
+        for weight in policy.parameters():
+            weight.add_(0.5)  # far from zero
+    config = FitConfig(steps=40, batch_size=32, lr=1e-3, schedule="constant", prior=256 * 100)
+    loss, begun = judgement(policy), judgement(policy)
+    for until in (20, None):
+        fit(loss, buffer, config, seed=0, checkpoint=tmp_path / "fit.pt", until=until)
+    origins = inherited(loss)
+    assert len(origins) > 10
+    for weight, then in origins:
+        torch.testing.assert_close(weight, then, atol=0.05, rtol=0)
+    now, before = loss.network.module.head[1].weight, begun.network.module.head[1].weight
+    assert now.norm() < before.norm() / 4
+
+
+def judgement(policy):
+    words = torch.tensor([[1], [2]]).expand(2, 16)
+    judge = make_instruction_classifier(SHAPES, seed=0, init_from=policy, roles=True)
+    return InstructionLoss(judge, words, removal_rate=0.0)
 
 
 def test_only_losses_are_minimised():

@@ -37,7 +37,7 @@ def copy_weights(
     plan: Blueprint,
     widened: Sequence[tuple[nn.Module, nn.Module]] = (),
 ) -> None:
-    """Copy the weights of each pair's first module to its second.
+    """Copy the weights of each pair's first module to its second, which remembers them.
 
     Args:
         parts: modules of the same kind and sizes.
@@ -56,6 +56,9 @@ def copy_weights(
             own, theirs = taken.state_dict(), given.state_dict()
             fitted = {name: _last(weight, own[name]) for name, weight in theirs.items()}
             taken.load_state_dict(fitted)
+        for _, taken in [*parts, *widened]:
+            begun = {name: weight.detach().clone() for name, weight in taken.named_parameters()}
+            taken.inherited = begun  # type: ignore[assignment]
     except RuntimeError:
         origin: Blueprint | None = getattr(source, "network_config", None)
         described = f"{origin.config} for {origin.shapes}" if origin else "another network"
@@ -63,6 +66,23 @@ def copy_weights(
             f"the trunk of init_from does not fit: it is {described}, this is {plan.config} for "
             f"{plan.shapes}; give both the same preset, sizes and options"
         ) from None
+
+
+def inherited(module: nn.Module) -> list[tuple[nn.Parameter, Tensor]]:
+    """Return the parameters of a module that began as another network's, with what they were then.
+
+    >>> from ifo_grounding.networks import Shapes, make_goal_judge, make_policy
+    >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    >>> judge = make_goal_judge(shapes, init_from=make_policy(shapes, seed=0))
+    >>> all(torch.equal(now, then) for now, then in inherited(judge))
+    True
+    """
+    found = {}
+    for part in module.modules():
+        own = dict(part.named_parameters())
+        for name, value in getattr(part, "inherited", {}).items():
+            found[own[name]] = value.to(own[name].device)
+    return list(found.items())
 
 
 def _last(weight: Tensor, like: Tensor) -> Tensor:

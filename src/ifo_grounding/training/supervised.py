@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks.transfer import inherited
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
 
@@ -56,7 +57,9 @@ class FitConfig:
     """Decoupled weight decay; 0 makes AdamW the paper's Adam."""
     prior: float = 0.0
     """Weight decay is this over the number of samples, where that is more than ``weight_decay``: a
-    Gaussian prior on weights, which counts for the more the less there is to learn from."""
+    Gaussian prior on weights, which counts for the more the less there is to learn from. Its mean
+    is zero, or of weights that are another network's (``init_from``) what they were there (L2-SP,
+    Li et al. 2018): what one has learned is not for the other to forget."""
     grad_clip: float = 1.0
     """Largest norm of the gradient."""
     iteration: int = 50
@@ -101,6 +104,20 @@ def make_optimizer(
     """Return AdamW in its fused form."""
     trained = [parameter for parameter in parameters if parameter.requires_grad]
     return torch.optim.AdamW(trained, lr=lr, weight_decay=weight_decay, fused=True)
+
+
+def decay_towards_origin(optimizer: torch.optim.Optimizer, module: nn.Module) -> None:
+    """Let the weights that a module has inherited decay towards what they were, not to zero."""
+    begun = [(weight, start) for weight, start in inherited(module) if weight.requires_grad]
+
+    @torch.no_grad()
+    def undo(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        group = optimizer.param_groups[0]
+        for weight, start in begun:
+            weight.add_(start, alpha=group["lr"] * group["weight_decay"])
+
+    if begun:
+        optimizer.register_step_post_hook(undo)
 
 
 def total_loss(losses: TensorDictBase) -> Tensor:
@@ -165,6 +182,7 @@ def fit(
     """
     decay = config.decay(len(buffer)) if config.prior else config.weight_decay
     optimizer = make_optimizer(loss.parameters(), config.lr, decay)
+    decay_towards_origin(optimizer, loss)
     saved = None
     if checkpoint:
         parts: dict[str, Any] = {"loss": loss, "optimizer": optimizer}
