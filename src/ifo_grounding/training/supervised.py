@@ -116,8 +116,7 @@ def decay_towards_origin(optimizer: torch.optim.Optimizer, module: nn.Module) ->
         for weight, start in begun:
             weight.add_(start, alpha=group["lr"] * group["weight_decay"])
 
-    if begun:
-        optimizer.register_step_post_hook(undo)
+    optimizer.register_step_post_hook(undo)
 
 
 def total_loss(losses: TensorDictBase) -> Tensor:
@@ -182,7 +181,8 @@ def fit(
     """
     decay = config.decay(len(buffer)) if config.prior else config.weight_decay
     optimizer = make_optimizer(loss.parameters(), config.lr, decay)
-    decay_towards_origin(optimizer, loss)
+    if decay:
+        decay_towards_origin(optimizer, loss)
     saved = None
     if checkpoint:
         parts: dict[str, Any] = {"loss": loss, "optimizer": optimizer}
