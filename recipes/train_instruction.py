@@ -53,18 +53,19 @@ def losses(
     section = options.instruction
     policy = starting_policy(run, options, "instruction")
     context = context_of(options, "imitate") if policy is not None else 0
-    last = section.trials - 1
+    pool = demos.pool()
+    likely = [(True, beginning_seed(options, number)) for number in range(section.trials - 1)]
     return [
         InstructionLoss(
             build(
                 make_instruction_classifier,
                 options,
                 init_from=policy,
-                roles=number < last,
+                roles=roles,
                 context=context,
-                seed=beginning_seed(options, number % max(last, 1)),
+                seed=seed,
             ),
-            demos.pool(),
+            pool,
             negatives=section.negatives,
             removal_rate=section.removal_rate,
             warmup=section.removal_warmup,
@@ -74,7 +75,7 @@ def losses(
             states=states,
             strict=section.strict,
         )
-        for number in range(section.trials)
+        for roles, seed in [*likely, (False, options.seed)]
     ]
 
 

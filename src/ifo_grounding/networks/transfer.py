@@ -77,12 +77,12 @@ def inherited(module: nn.Module) -> list[tuple[nn.Parameter, Tensor]]:
     >>> all(torch.equal(now, then) for now, then in inherited(judge))
     True
     """
-    found = {}
+    found = []
     for part in module.modules():
-        own = dict(part.named_parameters())
-        for name, value in getattr(part, "inherited", {}).items():
-            found[own[name]] = value.to(own[name].device)
-    return list(found.items())
+        for name, then in getattr(part, "inherited", {}).items():
+            weight = part.get_parameter(name)
+            found.append((weight, then.to(weight.device)))
+    return found
 
 
 def _last(weight: Tensor, like: Tensor) -> Tensor:

@@ -54,12 +54,12 @@ class FitConfig:
     warmup: float = 0.1
     """Share of the steps that warm up, with ``cosine``."""
     weight_decay: float = 0.0
-    """Decoupled weight decay; 0 makes AdamW the paper's Adam."""
+    """Decoupled weight decay; 0 makes AdamW the paper's Adam. Weights decay to zero, or where they
+    are another network's (``init_from``) to what they were there (L2-SP, Li et al. 2018): what one
+    has learned is not for the other to forget."""
     prior: float = 0.0
     """Weight decay is this over the number of samples, where that is more than ``weight_decay``: a
-    Gaussian prior on weights, which counts for the more the less there is to learn from. Its mean
-    is zero, or of weights that are another network's (``init_from``) what they were there (L2-SP,
-    Li et al. 2018): what one has learned is not for the other to forget."""
+    Gaussian prior on weights, which counts for the more the less there is to learn from."""
     grad_clip: float = 1.0
     """Largest norm of the gradient."""
     iteration: int = 50
