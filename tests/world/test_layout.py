@@ -6,6 +6,7 @@ from scipy import stats
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.world import Layout, random_layout
+from ifo_grounding.world.layout import highest
 
 N = 20_000
 
@@ -121,3 +122,13 @@ def test_the_same_generator_gives_the_same_scenes():
 def test_an_impossible_layout_is_refused(wrong, said):
     with pytest.raises(UserError, match=said):
         Layout(**wrong)
+
+
+@pytest.mark.parametrize("cells", [9, 36, 256])
+@pytest.mark.parametrize("values", [2**24, 2**5], ids=["distinct", "many alike"])
+def test_places_are_drawn_as_topk_draws_them(cells, values):
+    draw = torch.Generator().manual_seed(0)
+    lots = torch.randint(values, (5000, cells), generator=draw) / values
+    for k in (1, 8, cells):
+        assert torch.equal(highest(lots, k), lots.topk(k).indices)
+    assert highest(lots, 0).shape == (5000, 0)

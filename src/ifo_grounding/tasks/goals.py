@@ -83,31 +83,33 @@ class Plan(TensorClass):
 def plan(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Plan:
     """Resolve what a goal refers to in an initial state, and judge it."""
     is_object = _shows(state.objects, goal.object)
-    from_box = (goal.task == PICK_OUT).unsqueeze(-1)
-    is_object = is_object & (~from_box | _shows(state.boxes, goal.source))
-    is_reference = _shows(state.objects, goal.reference)
-    is_target = _shows(state.boxes, goal.target)
-    places = is_object.byte().argmax(-1)
+    if (from_box := goal.task == PICK_OUT).any():
+        is_object = is_object & (~from_box.unsqueeze(-1) | _shows(state.boxes, goal.source))
+    places = _first(is_object)
+    counts = [is_object.sum(-1)]
 
-    n_objects = is_object.sum(-1)
-    n_references = torch.where(goal.task == PICK_UDLR, is_reference.sum(-1), 1)
+    anchor = places
     to_box = (goal.task == PICK) | (goal.task == PICK_OUT)
-    n_targets = torch.where(to_box, is_target.sum(-1), 1)
-
-    anchor = torch.where(goal.task == PICK_UDLR, is_reference.byte().argmax(-1), places)
+    if (beside_object := goal.task == PICK_UDLR).any():
+        is_reference = _shows(state.objects, goal.reference)
+        anchor = torch.where(beside_object, _first(is_reference), places)
+        counts.append(torch.where(beside_object, is_reference.sum(-1), 1))
     beside, inside = neighbour(anchor, goal.side, state.size)
     destination = torch.where(goal.has_side, beside, anchor)
-    destination = torch.where(to_box, is_target.byte().argmax(-1), destination)
+    if to_box.any():
+        is_target = _shows(state.boxes, goal.target)
+        destination = torch.where(to_box, _first(is_target), destination)
+        counts.append(torch.where(to_box, is_target.sum(-1), 1))
     inside = inside | ~goal.has_side
 
     steps = _distance(state.arm, torch.where(goal.carries, places, destination), state.size) + 1
     steps = steps + goal.carries * (2 + _distance(places, destination, state.size))
     at_destination = state.objects.gather(-1, destination.unsqueeze(-1)).squeeze(-1)
     is_there = torch.where(goal.carries, places, state.arm) == destination
-    counts = torch.stack([n_objects, n_references, n_targets])
+    found = torch.stack(counts)
     checks = (
-        ((counts == 0).any(0), MISSING),
-        ((counts > 1).any(0), AMBIGUOUS),
+        ((found == 0).any(0), MISSING),
+        ((found > 1).any(0), AMBIGUOUS),
         (~inside, OUT_OF_BOUNDS),
         ((goal.task != MOVE) & (at_destination > 0) & ~(goal.carries & is_there), OCCUPIED),
         (is_there, ALREADY_TRUE),
@@ -177,6 +179,11 @@ def _shows(cells: Tensor, wanted: Tensor) -> Tensor:
     """Return which cells [*B, C] show what is wanted [*B], nowhere if that is 0."""
     wanted = wanted.unsqueeze(-1)
     return (cells == wanted) & (wanted > 0)
+
+
+def _first(mask: Tensor) -> Tensor:
+    """Return the first true cell of each row, 0 where there is none, int64 [*B]."""
+    return mask.byte().argmax(-1)
 
 
 def _distance(start: Tensor, end: Tensor, size: int) -> Tensor:

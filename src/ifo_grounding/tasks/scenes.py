@@ -180,9 +180,10 @@ class SceneStream:
             good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
             missing[unfinished] -= good.sum(1)
             before = sum(len(each.wording) for each in proposed)
-            rows.append(good.flatten().nonzero().squeeze(-1) + before)
+            owner, place = good.nonzero(as_tuple=True)
+            rows.append(before + owner * good.shape[1] + place)
             proposed.append(proposal)
-            owners.append(unfinished.repeat_interleave(good.sum(1)))
+            owners.append(unfinished[owner])
             if not missing.any():
                 order = torch.cat(owners).argsort(stable=True)
                 scenes = _said(_chosen(proposed, torch.cat(rows)[order]), options.task)

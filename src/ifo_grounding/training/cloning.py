@@ -52,7 +52,7 @@ def accepted_steps(
             batch[keys.NEXT, "done"].squeeze(-1),
             threshold,
         )
-        kept.append(batch.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION)[mask].clone())
+        kept.append(batch.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION)[mask])
     collector.shutdown(close_env=False)
     chosen: TensorDictBase = torch.cat(kept)
     if not len(chosen):

@@ -28,7 +28,10 @@ def check_env(env: EnvBase) -> None:
 
 
 def make_collector(env: EnvBase, policy: nn.Module, steps: int) -> Collector:
-    """Return a collector of ``steps`` steps of each world per round, each from a reset."""
+    """Return a collector of ``steps`` steps of each world per round, each from a reset.
+
+    On a CPU a round is written over the one before: keep copies of what has to last.
+    """
     return Collector(
         env,
         policy,
@@ -37,6 +40,7 @@ def make_collector(env: EnvBase, policy: nn.Module, steps: int) -> Collector:
         reset_at_each_iter=True,
         trust_policy=True,
         auto_register_policy_transforms=False,
+        return_same_td=env.device is not None and env.device.type == "cpu",
     )
 
 

@@ -77,7 +77,7 @@ def random_layout(
     def count(low: int, high: int) -> Tensor:
         return low + (rand(1) * (high - low + 1)).long()
 
-    places = rand(cells).topk(most_boxes + most_objects).indices
+    places = highest(rand(cells), most_boxes + most_objects)
     box_cells, free_cells = places.split([most_boxes, most_objects], dim=-1)
 
     colours = 1 + rand(N_BOXES).argsort(-1)[:, :most_boxes]
@@ -106,3 +106,27 @@ def random_layout(
     arm = (rand(1).squeeze(-1) * cells).long()
     held = torch.zeros(batch, dtype=torch.uint8, device=device)
     return WorldState(arm=arm, held=held, objects=objects, boxes=boxes, batch_size=[batch])
+
+
+def highest(lots: Tensor, k: int) -> Tensor:
+    """Return where the highest of each row of lots lie, the highest first, int64 [N, k].
+
+    That is ``lots.topk(k).indices``, on a CPU in a quarter of the time.
+
+    Args:
+        lots: multiples of 2^-24 in [0, 1), as ``torch.rand`` draws them, float32 [N, C].
+        k: how many.
+    """
+    if lots.device.type != "cpu" or not k:
+        return lots.topk(k).indices
+    # Each place is written behind its lot, of 24 bits, for NumPy sorts whole numbers fastest.
+    bits = lots.shape[-1].bit_length()
+    ranked = (lots * 2 ** (24 + bits)).long().add_(torch.arange(lots.shape[-1]))
+    ranked.numpy().sort()
+    highest = ranked[:, -k - 1 :].flip(-1)
+    places = highest[:, :k] & (2**bits - 1)
+    drawn = highest >> bits
+    alike = (drawn[:, 1:] == drawn[:, :-1]).any(-1).nonzero().squeeze(-1)
+    if len(alike):  # lots that are equal come in an order of torch's own
+        places[alike] = lots[alike].topk(k).indices
+    return places
