@@ -45,6 +45,8 @@ NAMES = {
 PHASES = ("phase1", "phase2")
 NAMED = ("task", "demonstrations", "preset")
 JUDGED = ("suitable", "served", "servable")
+DECISIVE = ("transitions", "inverse", "imitate", "instruction", "reward", "goal", "self_examine")
+"""Sections of the options that decide what is learned."""
 
 BABYAI_POLICIES = {
     "bot": "demonstrator",
@@ -99,6 +101,7 @@ def study_section() -> list[str]:
         " (Holm) for the tasks with as many demonstrations.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table([shown(row, *JUDGED) for row in rows]),
+        differing_note(),
         "Of each seed the share of suitable instructions among those chosen, of states served, and"
         " of states that any instruction of the pool suits, by the oracle: the most that could be"
         " served.",
@@ -314,22 +317,60 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
         "task": task,
         "demonstrations": f"{n:,}",
         "preset": f"{kind}, {held_out:.0%} held out" if held_out else kind,
-        "seeds": len(runs),
+        "seeds": f"{len(runs)}†" if differing(runs) else len(runs),
         "scenes": f"{both[0].shape[1]:,}{stream}",
         "phase 1": brief(two_level_bootstrap(both[0])),
         "phase 2": brief(two_level_bootstrap(both[1])),
         "gain, points": brief(paired_difference(*both)),
     }
     for name in ("continued", "cloned"):
-        known = all(name in run["results"] for run in runs)
-        row[f"over {name}"] = (
-            brief(paired_difference(outcomes(runs, name), both[1])) if known else "not run"
-        )
+        row[f"over {name}"] = over_control(name, runs)
     suitable = [run["results"]["suitability"] for run in runs]
     row["suitable"] = ", ".join(f"{100 * s['rate']['rate']:.1f}" for s in suitable)
     row["served"] = ", ".join(f"{100 * s['served']['rate']:.0f}" for s in suitable)
     row["servable"] = ", ".join(f"{100 * s['servable']['rate']:.0f}" for s in suitable)
     return row
+
+
+def over_control(name: str, runs: list[dict[str, Any]]) -> str:
+    """Return how far phase 2 is ahead of a control, of the seeds that ran it."""
+    having = [run for run in runs if name in run["results"]]
+    if not having:
+        return "not run"
+    ahead = brief(paired_difference(outcomes(having, name), outcomes(having, "phase2")))
+    return ahead if len(having) == len(runs) else f"{ahead} ({len(having)} of {len(runs)} seeds)"
+
+
+def differing(runs: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    """Return the options that decide what is learned and are not those of all seeds, by seed.
+
+    Runs from before an option was there have none, which is the same as zero.
+    """
+    every = [
+        {
+            f"{part}.{name}": value
+            for part in DECISIVE
+            for name, value in run["options"][part].items()
+        }
+        for run in runs
+    ]
+    values = {name: [each.get(name) or 0 for each in every] for name in set().union(*every)}
+    return {
+        name: found for name, found in sorted(values.items()) if found.count(found[0]) < len(found)
+    }
+
+
+def differing_note() -> str:
+    """Say in which options the seeds of a study differ."""
+    told = []
+    for (task, n, kind, _), runs in practised().items():
+        if found := differing(runs):
+            options = ", ".join(
+                f"`{name}` {', '.join(f'{value:,}' for value in values)}"
+                for name, values in found.items()
+            )
+            told.append(f"{task}, {n:,}, {kind}: {options}")
+    return f"† made with different options, by seed: {'; '.join(told)}." if told else ""
 
 
 def adjusted(found: dict[Key, list[dict[str, Any]]]) -> list[str]:
@@ -393,25 +434,15 @@ def efficiency_section() -> list[str]:
     return [
         "## Data efficiency",
         "The same studies by number of demonstrations, preset `strong`. The dashed line is the"
-        f" paper's best policy, after its phase 2 with 80,000 demonstrations. {with_prior()}"
+        " paper's best policy, after its phase 2 with 80,000 demonstrations. Up to 500 are imitated"
+        " with the [prior](phase1.md#few-demonstrations); of those with more, most are from before"
+        " it."
         " With 80,000 they are those of [the paper's tables](tables.md), which learn for longer.",
         f"![Success against the number of demonstrations](assets/{EFFICIENCY.name})",
         "The fewest of the tried numbers of demonstrations with which an interval lies above that"
         " of the paper, whose rates look like 500 episodes:",
         markdown_table(rows),
     ]
-
-
-def with_prior() -> str:
-    """Say which of these studies imitated with the prior, which the first ones did not know."""
-    numbers = {
-        n
-        for (_, n, kind, _), runs in practised().items()
-        if kind == "strong" and runs[0]["options"]["imitate"].get("prior")
-    }
-    *most, last = [f"{n:,}" for n in sorted(numbers)] or ["none"]
-    told = f"{', '.join(most)} and {last}" if most else last
-    return f"Imitated with the [prior](phase1.md#few-demonstrations): {told}; the others without."
 
 
 def efficiency_picture() -> Figure:
@@ -468,11 +499,13 @@ def page(found: list[dict[str, Any]]) -> str:
 
 def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
-    aside = ("preset", "scenes", "p", *JUDGED)
+    aside = ("preset", "scenes", *JUDGED)
     found = zip(practised(), study_rows(), strict=True)
     few = [row for (_, n, *_), row in found if n <= FEW and row["preset"] == "strong"]
     rows = [shown(row, *aside) for row in few]
-    text = renewed(text, "results", f"\n{markdown_table(rows)}\n")
+    note = "\n† made with [different options](docs/results.md#studies), by seed.\n"
+    mixed = note if any("†" in str(row["seeds"]) for row in rows) else ""
+    text = renewed(text, "results", f"\n{markdown_table(rows)}\n{mixed}")
     return renewed(text, "babyai", strong_levels())
 
 

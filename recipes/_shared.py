@@ -54,8 +54,11 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
     decisive = {key: plain(options[key]) for key in [*common, *sections]}
     if changed := changed_networks(options):
         decisive["networks"] = changed  # only then: runs without any go on as they were
-    stage = open_run(options).stage(name, decisive, needs)
-    print(f"{name}: {'done before' if stage.result is not None else 'running'}", flush=True)
+    run = open_run(options)
+    stage = run.stage(name, decisive, needs)
+    again = ", for its options or an earlier stage are not what they were"
+    doing = f"running{again if run.record(name) else ''}"
+    print(f"{name}: {'done before' if stage.result is not None else doing}", flush=True)
     return stage
 
 

@@ -1,8 +1,10 @@
 """Evaluate what a run has trained: success, chosen instructions, labels and judges."""
 
+import sys
 from typing import Any
 
 import torch
+from _options import as_made
 from _results import keep_result, write_result
 from _shared import (
     CLASSIFIER,
@@ -52,6 +54,12 @@ def evaluate(options: DictConfig) -> dict:
         return stage.result
     run = stage.run
     run.need(POLICIES[0], "imitate")
+    if options.evaluate.split == "zero-shot" and options.world.get("split") != "train":
+        print(
+            "note: the demonstrations name the pairs of these scenes, too (world.split="
+            f"{options.world.get('split')}): what is measured is no zero-shot success",
+            file=sys.stderr,
+        )
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
     results: dict[str, Any] = {"labels": run.record("label")["result"]["accuracy"]}
     policies = {
@@ -164,6 +172,7 @@ def evaluation_scenes(options: DictConfig) -> dict[str, Any]:
 
 @recipe_main
 def main(options: DictConfig) -> None:
+    options = as_made(options)
     results = evaluate(options)
     if options.results:
         keep_result(options, write_result(options, results, "evaluate"))

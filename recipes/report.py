@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from _options import as_made
 from _shared import (
     CLASSIFIER,
     GOAL,
@@ -77,8 +78,14 @@ def report(options: DictConfig) -> Path:
         pictures,
         title=f"{options.task}, preset {options.network}",
         summary=f"{options.demonstrations.n:,} demonstrations, seed {options.seed}, "
-        f"{options.evaluate.episodes:,} evaluation scenes ({options.evaluate.stream}).",
+        f"{options.evaluate.episodes:,} evaluation scenes ({scenes_of(options)}).",
     )
+
+
+def scenes_of(options: DictConfig) -> str:
+    """Return which scenes are evaluated, in words."""
+    stream, split = options.evaluate.stream, options.evaluate.split
+    return stream if split == "all" else f"{stream}, {split} instructions"
 
 
 def episode_pictures(run: Run, world: World) -> dict[str, Any]:
@@ -159,7 +166,7 @@ def curves(run: Run) -> dict[str, Any]:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(report(options))
+    print(report(as_made(options)))
 
 
 if __name__ == "__main__":

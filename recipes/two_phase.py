@@ -1,5 +1,6 @@
 """Both phases on one task, and a report: the main job."""
 
+from _options import check
 from _results import write_result
 from _shared import CONTROLS, POLICIES, open_run, plain
 from collect_transitions import collect
@@ -39,6 +40,7 @@ def two_phase(options: DictConfig) -> dict:
 
 
 def train_phases(options: DictConfig) -> None:
+    check(options)
     run = open_run(options)
     if options.base:
         run.take_over(Run(options.base), without=PHASE_2)

@@ -76,7 +76,7 @@ def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
     from controls import matched_steps
     from study import study
 
-    given = ("study", f"results={tmp_path / 'results'}", "self_examine.steps=20", "imitate.lr=1e-4")
+    given = ("study", f"results={tmp_path / 'results'}", "imitate.lr=1e-4")
     options = compose(*given)
     alone = study(compose(*given, "controls.clone=false"))
     assert "continued" in alone and "cloned" not in alone

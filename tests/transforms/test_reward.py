@@ -250,6 +250,7 @@ def test_beside_a_reward_sum():
         ({"stop_action": "last"}, "unknown stop_action 'last'"),
         ({"arrival": 0.9}, "of the judge of goals.*kind='action'"),
         ({"kind": "goal", "arrival": 1.5}, "within 0..1, got 1.5"),
+        ({"kind": "goal"}, "writes 'action_score'.* says 'goal_score'"),
     ],
 )
 def test_impossible_options(options, message):

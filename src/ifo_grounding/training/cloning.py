@@ -43,7 +43,7 @@ def accepted_steps(
     check_env(env)
     policy.eval()
     collector = make_collector(env, policy, steps)
-    batches, kept = iter(collector), []
+    batches, kept, ended = iter(collector), [], False
     for iteration in range(iterations):
         reseed(env, derive(seed, "accepted steps", iteration))
         batch = next(batches)
@@ -52,15 +52,17 @@ def accepted_steps(
             batch[keys.NEXT, "done"].squeeze(-1),
             threshold,
         )
+        ended |= bool(batch[keys.NEXT, "done"][:, :-1].any())
         kept.append(batch.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION)[mask])
     collector.shutdown(close_env=False)
     chosen: TensorDictBase = torch.cat(kept)
     if not len(chosen):
+        lower = "lower the threshold (controls.accept), train policy and judge for longer"
+        longer = f"none ended within {steps} steps: play for longer (self_examine.steps)"
         raise UserError(
             f"the judge accepted no episode of {iterations} rounds in {env.batch_size.numel()} "
-            f"environments, at a learned return of {threshold:g} or more: lower the "
-            "threshold (controls.accept), train policy and judge for longer, or do without cloning "
-            "(controls.run=false)"
+            f"environments, at a learned return of {threshold:g} or more: "
+            f"{lower if ended else longer}, or do without cloning (controls.clone=false)"
         )
     return chosen
 

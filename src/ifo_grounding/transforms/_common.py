@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.keys import ACTION_SCORE, GOAL_SCORE, SUITABILITY
 
 
 class EpisodeTransform(Transform):
@@ -137,7 +138,8 @@ def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:
     """Key under which a TensorDictModule writes its logit.
 
     Raises:
-        UserError: where ``judge`` is no TensorDictModule, or it is unclear which output is meant.
+        UserError: where ``judge`` is no TensorDictModule, it is unclear which output is meant, or
+            it is what another judge says.
     """
     if not isinstance(judge, TensorDictModuleBase):
         raise UserError(
@@ -149,7 +151,11 @@ def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:
             return name
     if len(names) != 1:
         raise UserError(f"the module writes {names}: one of them must be named {expected!r}")
-    return names[0]
+    if (written := names[0]) in (ACTION_SCORE, GOAL_SCORE, SUITABILITY):
+        raise UserError(
+            f"the module writes {written!r}: what is needed here is a judge that says {expected!r}"
+        )
+    return written
 
 
 def flat_logit(logit: Tensor, rows: int, name: NestedKey) -> Tensor:

@@ -1,0 +1,108 @@
+"""Options as a whole: refused before a run begins, and those that a finished run was made with."""
+
+import importlib.util
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from _shared import fit_config, plain, self_examination_config
+from _worlds import Grid, open_world
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.files import read_json
+from ifo_grounding.training import Run
+from ifo_grounding.transforms.choosing import check_options
+
+LEARNED = ("inverse", "imitate", "instruction", "reward", "goal")
+"""Sections that say how a network learns."""
+EXTRAS = ("tensorboard", "wandb")
+"""Loggers that are packages of their own, and extras of this one."""
+OF_A_COMMAND = (
+    "run",
+    "base",
+    "results",
+    "variant",
+    "device",
+    "threads",
+    "logger",
+    "progress",
+    "checkpoint_seconds",
+)
+"""Options that say nothing about what a run has learned."""
+OF_EVALUATION = (
+    "evaluate",
+    "instruction.threshold",
+    "instruction.candidates",
+    "instruction.choose",
+    "self_examine.recombine",
+)
+"""Options that may be others when what was learned is evaluated."""
+GROUPS = {"preset": ["network"], "world": ["simulator", "world"]}
+"""Choices of several options at once, and what they decide of what was learned."""
+
+
+def check(options: DictConfig) -> None:
+    """Refuse before a run begins what a later stage would, after hours perhaps.
+
+    Raises:
+        UserError: on a value that its stage would refuse, a device that is not there, or a logger
+            that is not installed.
+    """
+    device = str(options.device)
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"device={device}: torch sees no GPU here; use device=cpu")
+    extra = options.logger
+    if extra in EXTRAS and importlib.util.find_spec(extra) is None:
+        raise UserError(
+            f"logger={extra} needs the extra of that name: pip install 'ifo-grounding[{extra}]', "
+            "or use logger=csv"
+        )
+    world = open_world(options)
+    if isinstance(world, Grid):  # others need the words of their demonstrations first
+        world.simulator()
+    for section in LEARNED:
+        fit_config(options[section])
+    self_examination_config(options.self_examine)
+    chosen = options.instruction
+    check_options(chosen.threshold, chosen.candidates, chosen.choose)
+
+
+def as_made(options: DictConfig) -> DictConfig:
+    """Return the options that the run of a command was made with, but for what the command names.
+
+    Without, a run that was made with other options than the defaults would be taken for another.
+
+    Raises:
+        UserError: where the command names what contradicts how the run was made.
+    """
+    named = [name.lstrip("+~").split("=")[0] for name in HydraConfig.get().overrides.task]
+    path = Run(options.run) / "options.json"
+    return merged(options, read_json(path), named) if path.exists() else options
+
+
+def merged(options: DictConfig, made: dict[str, Any], named: Sequence[str]) -> DictConfig:
+    """Return the options ``made``, but for those of a command and what it names."""
+    here = plain(options)
+    result = OmegaConf.create({**here, **made})  # what is new since has today's value
+    result.evaluate = OmegaConf.merge(here["evaluate"], made["evaluate"])
+    for name in [*OF_A_COMMAND, *named]:
+        value = plain(OmegaConf.select(options, name))
+        if name in OF_A_COMMAND or name.startswith(OF_EVALUATION):
+            OmegaConf.update(result, name, value, merge=False)
+        elif name == "budget":
+            result.evaluate = here["evaluate"]
+        elif not name.startswith("hydra"):
+            for decided in GROUPS.get(name, [name]):
+                _check_same(result, options, decided)
+    return result
+
+
+def _check_same(result: DictConfig, options: DictConfig, name: str) -> None:
+    here, there = (plain(OmegaConf.select(each, name)) for each in (options, result))
+    if here != there:
+        raise UserError(
+            f"the run {options.run} was made with {name}={there}, not {here}: leave {name} out, or "
+            "name another run"
+        )
