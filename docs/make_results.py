@@ -350,7 +350,7 @@ def differing(runs: list[dict[str, Any]]) -> dict[str, list[Any]]:
         {
             f"{part}.{name}": value
             for part in DECISIVE
-            for name, value in run["options"][part].items()
+            for name, value in run["options"].get(part, {}).items()
         }
         for run in runs
     ]

@@ -59,7 +59,9 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
         rates = {"rate": 0.9, "served": 0.5, "servable": 0.6}
         results["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
         options = {"task": "pick", "demonstrations": {"n": 2000}, "network": "strong", "seed": seed}
-        options["imitate"] = {"held_out": 0.0}
+        options["imitate"] = {"held_out": 0.0, "prior": 2000 * seed}
+        if seed:
+            del results["continued"]
         run = {
             "options": options,
             "results": results,
@@ -71,8 +73,13 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
     first = next(iter(script.studies().values()))
     assert script.outcomes(first, "phase2").tolist() == [[True] * 6 + [False] * 2] * 2
     table = "\n".join(script.study_section())
-    for shown in ("| pick | 2,000 | strong | 2 |", "50.0%", "75.0%", "+25.0", "+12.5", "not run"):
+    for shown in ("| pick | 2,000 | strong | 2† |", "50.0%", "75.0%", "+25.0", "+12.5", "not run"):
         assert shown in table
+    assert "(1 of 2 seeds)" in table
+    assert (
+        "† made with different options, by seed: pick, 2,000, strong: `imitate.prior` 0, 2,000."
+        in table
+    )
 
 
 def test_the_fewest_demonstrations_that_beat_the_paper_are_found(monkeypatch):
