@@ -178,7 +178,15 @@ def fit(
 
     Returns:
         Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
+
+    Raises:
+        UserError: where ``buffer`` cannot be sampled, or the checkpoint is of something else.
     """
+    if not callable(getattr(buffer, "sample", None)):
+        raise UserError(
+            f"fit samples from a replay buffer, got {type(buffer).__name__}: demonstrations become "
+            "one by labelled_buffer(demos, label_demonstrations(demos, inverse).actions)"
+        )
     decay = config.decay(len(buffer)) if config.prior else config.weight_decay
     optimizer = make_optimizer(loss.parameters(), config.lr, decay)
     if decay:
