@@ -1,7 +1,8 @@
 """Whether speed costs success: ``python benchmarks/curves.py`` learns with and without it.
 
 Imitation of the true actions of 3,000 demonstrations of ``move``, preset ``strong``: cells that
-look alike are computed once, as on any CPU, or each by itself. Writes ``results/bench/curves.json``.
+look alike are computed once, as on any CPU, or each by itself. Writes
+``results/bench/curves.json``.
 """
 
 from __future__ import annotations
