@@ -258,7 +258,6 @@ def imitation(preset: str) -> Row:
     actions = torch.randint(6, (demos.transitions,), dtype=torch.uint8)
     buffer = labelled_buffer(demos, actions)
     policy = networks.make_policy(demos, preset, seed=0, device=DEVICE)
-    rough = networks.make_policy(demos, preset, seed=0, device=DEVICE, precision="bf16")
     config = FitConfig(steps=steps, batch_size=size, iteration=steps, schedule="constant")
 
     def work(policy: torch.nn.Module = policy) -> float:
@@ -267,6 +266,7 @@ def imitation(preset: str) -> Row:
 
     if preset == "strong":
         return Row("imitation, preset strong", "samples/s", ours(work), {"rate": 16e3})
+    rough = networks.make_policy(demos, preset, seed=0, device=DEVICE, precision="bf16")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.npz"
         batch = buffer.sample(4096)

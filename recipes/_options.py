@@ -1,11 +1,9 @@
 """Options as a whole: refused before a run begins, and those that a finished run was made with."""
 
-import importlib.util
 from collections.abc import Sequence
 from typing import Any
 
-import torch
-from _shared import fit_config, plain, self_examination_config
+from _shared import RUNNING, fit_config, plain, self_examination_config
 from _worlds import Grid, open_world
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -17,19 +15,7 @@ from ifo_grounding.transforms.choosing import check_options
 
 LEARNED = ("inverse", "imitate", "instruction", "reward", "goal")
 """Sections that say how a network learns."""
-EXTRAS = ("tensorboard", "wandb")
-"""Loggers that are packages of their own, and extras of this one."""
-OF_A_COMMAND = (
-    "run",
-    "base",
-    "results",
-    "variant",
-    "device",
-    "threads",
-    "logger",
-    "progress",
-    "checkpoint_seconds",
-)
+OF_A_COMMAND = ("run", "base", "results", "variant", *RUNNING)
 """Options that say nothing about what a run has learned."""
 OF_EVALUATION = (
     "evaluate",
@@ -47,18 +33,8 @@ def check(options: DictConfig) -> None:
     """Refuse before a run begins what a later stage would, after hours perhaps.
 
     Raises:
-        UserError: on a value that its stage would refuse, a device that is not there, or a logger
-            that is not installed.
+        UserError: on a value that its stage would refuse.
     """
-    device = str(options.device)
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError(f"device={device}: torch sees no GPU here; use device=cpu")
-    extra = options.logger
-    if extra in EXTRAS and importlib.util.find_spec(extra) is None:
-        raise UserError(
-            f"logger={extra} needs the extra of that name: pip install 'ifo-grounding[{extra}]', "
-            "or use logger=csv"
-        )
     world = open_world(options)
     if isinstance(world, Grid):  # others need the words of their demonstrations first
         world.simulator()

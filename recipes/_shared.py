@@ -17,6 +17,7 @@ from torchrl.data import ReplayBuffer
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
+from ifo_grounding.errors import UserError
 from ifo_grounding.objectives import SupervisedLoss
 from ifo_grounding.seeding import derive
 from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
@@ -36,10 +37,14 @@ REFERENCE = "reference-true-actions.safetensors"
 CLASSIFIER = "instruction.safetensors"
 REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
+RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
+"""Options that decide no result."""
 
 
 def open_run(options: DictConfig) -> Run:
     """Return the run of these options, with torch's threads and memory set."""
+    if str(options.device).startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"device={options.device}: torch sees no GPU here; use device=cpu")
     keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:
@@ -56,9 +61,13 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
         decisive["networks"] = changed  # only then: runs without any go on as they were
     run = open_run(options)
     stage = run.stage(name, decisive, needs)
-    again = ", for its options or an earlier stage are not what they were"
-    doing = f"running{again if run.record(name) else ''}"
-    print(f"{name}: {'done before' if stage.result is not None else doing}", flush=True)
+    if stage.result is not None:
+        doing = "done before"
+    elif run.record(name):
+        doing = "running, for its options or an earlier stage are not what they were"
+    else:
+        doing = "running"
+    print(f"{name}: {doing}", flush=True)
     return stage
 
 

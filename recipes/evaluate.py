@@ -54,10 +54,11 @@ def evaluate(options: DictConfig) -> dict:
         return stage.result
     run = stage.run
     run.need(POLICIES[0], "imitate")
-    if options.evaluate.split == "zero-shot" and options.world.get("split") != "train":
+    named = options.world.get("split")
+    if options.evaluate.split == "zero-shot" and named != "train":
         print(
-            "note: the demonstrations name the pairs of these scenes, too (world.split="
-            f"{options.world.get('split')}): what is measured is no zero-shot success",
+            f"note: the demonstrations name the pairs of these scenes, too (world.split={named}): "
+            "what is measured is no zero-shot success",
             file=sys.stderr,
         )
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.

@@ -14,7 +14,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from _shared import plain, result_file
+from _shared import RUNNING, plain, result_file
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
@@ -38,8 +38,6 @@ WANTED = {
     ("figure", 6): (*PHASES[:2], GOAL),
 }
 """Pieces that each table and figure of the paper is made from; the first has phase 1."""
-RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
-"""Options that decide no result."""
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ def two_phase(options: DictConfig) -> dict:
 
 
 def train_phases(options: DictConfig) -> None:
-    check(options)
     run = open_run(options)
+    check(options)
     if options.base:
         run.take_over(Run(options.base), without=PHASE_2)
     write_json(run / "options.json", plain(options))

@@ -52,7 +52,7 @@ def accepted_steps(
             batch[keys.NEXT, "done"].squeeze(-1),
             threshold,
         )
-        ended |= bool(batch[keys.NEXT, "done"][:, :-1].any())
+        ended |= bool(batch[keys.NEXT, "done"][:, :-1].any())  # the last step is cut for all
         kept.append(batch.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION)[mask])
     collector.shutdown(close_env=False)
     chosen: TensorDictBase = torch.cat(kept)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,9 @@ from ifo_grounding.files import home, read_json, write_json
 from ifo_grounding.training.checkpoint import fingerprint
 from ifo_grounding.training.supervised import Log, Metrics
 
-LOGGERS = ("csv", "tensorboard", "wandb", "none")
+EXTRAS = ("tensorboard", "wandb")
+"""Loggers that are packages of their own, and extras of this one."""
+LOGGERS = ("csv", *EXTRAS, "none")
 
 
 class Run:
@@ -24,6 +27,9 @@ class Run:
         name: name of the run under the home folder (see :func:`ifo_grounding.files.home`), or a
             path to a folder anywhere.
         logger: ``csv``, ``tensorboard``, ``wandb`` or ``none``: where metrics go while training.
+
+    Raises:
+        UserError: on a logger that is unknown or not installed.
 
     >>> import tempfile
     >>> run = Run(tempfile.mkdtemp())
@@ -38,6 +44,11 @@ class Run:
 
     def __init__(self, name: str | Path, logger: str = "csv") -> None:
         check_choice("logger", logger, LOGGERS)
+        if logger in EXTRAS and importlib.util.find_spec(logger) is None:
+            raise UserError(
+                f"logger={logger} needs the extra of that name: "
+                f"pip install 'ifo-grounding[{logger}]', or use logger=csv"
+            )
         given = Path(name).expanduser()
         self.folder = (
             given if given.is_absolute() or len(given.parts) > 1 else home() / "runs" / name

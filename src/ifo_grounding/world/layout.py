@@ -123,9 +123,9 @@ def highest(lots: Tensor, k: int) -> Tensor:
     bits = lots.shape[-1].bit_length()
     ranked = (lots * 2 ** (24 + bits)).long().add_(torch.arange(lots.shape[-1]))
     ranked.numpy().sort()
-    highest = ranked[:, -k - 1 :].flip(-1)
-    places = highest[:, :k] & (2**bits - 1)
-    drawn = highest >> bits
+    first = ranked[:, -k - 1 :].flip(-1)
+    places = first[:, :k] & (2**bits - 1)
+    drawn = first >> bits
     alike = (drawn[:, 1:] == drawn[:, :-1]).any(-1).nonzero().squeeze(-1)
     if len(alike):  # lots that are equal come in an order of torch's own
         places[alike] = lots[alike].topk(k).indices
