@@ -1,16 +1,19 @@
 """Sets of demonstrations whose pixels are more than memory may hold."""
 
+import copy
 import gc
+import os
+import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
-from tensordict import MemoryMappedTensor
 
 from comparing import all_frames
 from ifo_grounding.data import Demonstrations, FrameCodec, _reading, _spool, codec, goal_buffer
-from ifo_grounding.data._spool import Spool
+from ifo_grounding.data._spool import Spool, is_mapped
 from ifo_grounding.errors import UserError
 
 SCRIPT = """
@@ -74,7 +77,7 @@ def episodes(side=20):
 def test_frames_on_disk_are_those_that_were_read(side, scratch, tmp_path, monkeypatch):
     monkeypatch.setattr(codec, "PATIENCE_BYTES", 1)
     demos = Demonstrations.from_episodes(episodes(side), close=False)
-    assert isinstance(demos.codes, MemoryMappedTensor)
+    assert is_mapped(demos.codes)
     assert torch.equal(all_frames(demos), torch.cat([shown for _, shown, _ in episodes(side)]))
     closed, chosen = demos.close_episodes(), demos[[7, 2, 5]]
     assert torch.equal(closed.lengths, demos.lengths + 1)
@@ -87,16 +90,32 @@ def test_frames_on_disk_are_those_that_were_read(side, scratch, tmp_path, monkey
         assert torch.equal(goal_buffer(back)[:]["final"], goal_buffer(one)[:]["final"])
 
 
-def test_scratch_files_go_with_what_they_hold(scratch):
+def test_what_is_on_disk_has_no_file_that_could_stay(scratch):
     demos = Demonstrations.from_episodes(episodes())
     part = demos[:2]
-    assert len(list(scratch.iterdir())) == 1
+    assert is_mapped(demos.codes)
+    assert not list(scratch.iterdir())
     del demos
     gc.collect()
     assert part[1]["pixels"].shape == (4, 3, 20, 20)
-    del part
-    gc.collect()
-    assert not list(scratch.iterdir())
+
+
+COPY = """
+import pickle, sys
+from test_large import episodes
+from ifo_grounding.data import Demonstrations, _spool
+
+_spool.MEMORY_BYTES = 4000
+sys.stdout.buffer.write(pickle.dumps(Demonstrations.from_episodes(episodes())))
+"""
+
+
+def test_what_is_on_disk_is_copied_and_outlives_its_process(scratch):
+    demos = Demonstrations.from_episodes(episodes())
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    other = subprocess.run([sys.executable, "-c", COPY], env=env, check=True, capture_output=True)
+    for one in (pickle.loads(other.stdout), copy.deepcopy(demos)):
+        assert torch.equal(all_frames(one), all_frames(demos))
 
 
 def test_no_scratch_file_stays_after_a_mistake(scratch):
@@ -116,9 +135,9 @@ def test_rows_on_disk_take_the_type_of_the_largest(scratch):
     for value in (0, 200, 300, 70_000):
         spool.append(torch.full((500, 4), value, dtype=codec.smallest_dtype(value + 1)))
     rows = spool.tensor(torch.int32)
-    assert isinstance(rows, MemoryMappedTensor)
+    assert is_mapped(rows)
     assert rows[:, 3].tolist() == [0] * 500 + [200] * 500 + [300] * 500 + [70_000] * 500
-    assert len(list(scratch.iterdir())) == 1
+    assert not list(scratch.iterdir())
 
 
 def test_a_dictionary_that_saves_little_is_given_up(monkeypatch):

@@ -1,9 +1,11 @@
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -51,6 +53,20 @@ def simulator(num_envs=16, **kwargs):
 def make_env(judge=None, num_envs=16):
     sampler = InstructionSampler(accepts_all(), POOL)
     return TransformedEnv(simulator(num_envs), Compose(sampler, LearnedReward(judge or likes(1))))
+
+
+def nested():
+    """Transforms around an environment that has some already."""
+    sampled = TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))
+    return TransformedEnv(sampled, LearnedReward(likes(1)))
+
+
+def of_pairs():
+    """The same, of which the inner ones keep the scenes."""
+    pairs = select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
+    return TransformedEnv(
+        TransformedEnv(simulator(8), StartingPairs(pairs)), LearnedReward(likes(1))
+    )
 
 
 def make_networks():
@@ -151,9 +167,10 @@ def test_without_discount_it_learns_what_torchrls_estimator_would_teach_it():
     assert not all(map(torch.equal, learned[0], untrained))
 
 
-def test_a_killed_run_continues_to_the_same_weights(tmp_path):
+@pytest.mark.parametrize("make", [make_env, nested, of_pairs])
+def test_a_killed_run_continues_to_the_same_weights(tmp_path, make):
     whole = make_networks()
-    expected = self_examine(make_env(), *whole, config(iterations=3), seed=0)
+    expected = self_examine(make(), *whole, config(iterations=3), seed=0)
 
     class Killed(BaseException):
         pass
@@ -165,11 +182,11 @@ def test_a_killed_run_continues_to_the_same_weights(tmp_path):
     path = tmp_path / "run.pt"
     with pytest.raises(Killed):
         self_examine(
-            make_env(), *make_networks(), config(iterations=3), seed=0, checkpoint=path, log=kill
+            make(), *make_networks(), config(iterations=3), seed=0, checkpoint=path, log=kill
         )
     resumed, steps = make_networks(), []
     history = self_examine(
-        make_env(),
+        make(),
         *resumed,
         config(iterations=3),
         seed=0,
@@ -216,6 +233,20 @@ def test_stored_pairs_are_practised():
     assert set(env.base_env.scene_numbers.tolist()) <= set(pairs["scene"].flatten().tolist())
 
 
+@pytest.mark.filterwarnings("ignore:A lambda function was passed to ParallelEnv")
+@pytest.mark.parametrize("kind", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
+def test_worlds_in_workers_are_practised_in(kind):
+    worlds = kind(2, lambda: simulator(4))
+    env = TransformedEnv(
+        worlds, Compose(InstructionSampler(accepts_all(), POOL), LearnedReward(likes(1)))
+    )
+    try:
+        history = self_examine(env, *make_networks(), config(iterations=2), seed=0)
+    finally:
+        env.close(raise_if_closed=False)
+    assert history[-1]["frames"] == 2 * 4 * 8
+
+
 def test_no_true_reward_reaches_the_learner():
     """The simulator would pay for success; what is learned from does not even hold that entry."""
     seen = []
@@ -241,6 +272,9 @@ def test_envs_that_leak_or_lack_something_are_refused():
     policy, value = make_networks()
     with pytest.raises(UserError, match="never sees the true state"):
         self_examine(simulator(expose_state=True), policy, value, config(), seed=0)
+    with pytest.raises(UserError, match="never sees the true state"):
+        worlds = SerialEnv(2, lambda: simulator(4, expose_state=True))
+        self_examine(worlds, policy, value, config(), seed=0)
     with pytest.raises(UserError, match="no instructions"):
         self_examine(simulator(), policy, value, config(), seed=0)
     sampled = TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))

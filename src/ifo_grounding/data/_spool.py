@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import mmap
 import os
 import weakref
 from collections.abc import Callable, Iterator
@@ -9,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tensordict import MemoryMappedTensor
 from torch import Tensor
 
 from ifo_grounding.files import scratch_file
@@ -17,6 +18,9 @@ from ifo_grounding.files import scratch_file
 MEMORY_BYTES = 128 << 20
 """What may be in memory of one table of rows, or of one dictionary of tiles."""
 PIECE_BYTES = 16 << 20
+
+_MAPPINGS: weakref.WeakValueDictionary[int, mmap.mmap] = weakref.WeakValueDictionary()
+"""Of each table that is in a file: its mapping, by the address of its first item."""
 
 
 class Spool:
@@ -52,18 +56,19 @@ class Spool:
     def tensor(self, dtype: torch.dtype) -> Tensor:
         """Return all rows as one tensor, mapped where they are in a file; empties the spool.
 
-        The file goes with the tensor.
+        The file has no name any more, so that whatever becomes of the process leaves none.
         """
         if self._path is None:
             return join(self._waiting, dtype)
         if any(found != dtype for _, found in self._written):
             return self.map(lambda piece: piece.to(dtype)).tensor(dtype)
         rows = sum(shape[0] for shape, _ in self._written)
-        shape = (rows, *self._written[0][0][1:])
-        mapped = MemoryMappedTensor.from_filename(str(self._path), dtype, shape)
-        self._remover.detach()
-        weakref.finalize(mapped, _remove, self._path, os.getpid())
+        with self._path.open("r+b") as file:
+            mapping = mmap.mmap(file.fileno(), 0)
+        self._remover()
         self._path = None
+        mapped = torch.frombuffer(mapping, dtype=dtype).view(rows, *self._written[0][0][1:])
+        _MAPPINGS[mapped.data_ptr()] = mapping
         return mapped
 
     def _write(self) -> None:
@@ -91,7 +96,19 @@ class Spool:
 def _remove(path: Path, process: int) -> None:
     """Remove a file, but not from a fork of the process that made it."""
     if os.getpid() == process:
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(PermissionError):  # Windows keeps what is mapped
+            path.unlink(missing_ok=True)
+
+
+def is_mapped(table: Tensor) -> bool:
+    """Tell whether a table begins what a :class:`Spool` keeps in a file."""
+    return table.data_ptr() in _MAPPINGS
+
+
+def release(table: Tensor) -> None:
+    """Give back the memory of a table that is in a file; what is used again is read again."""
+    if (mapping := _MAPPINGS.get(table.data_ptr())) and hasattr(mmap, "MADV_DONTNEED"):
+        mapping.madvise(mmap.MADV_DONTNEED)
 
 
 def join(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
@@ -115,6 +132,11 @@ def take(table: Tensor, rows: Tensor) -> Tensor:
     for some in rows.split(_rows_per_piece(table)):
         spool.append(table[some])
     return spool.tensor(table.dtype)
+
+
+def pieces(table: Tensor) -> tuple[Tensor, ...]:
+    """Cut a table into pieces of some ``PIECE_BYTES``."""
+    return table.split(_rows_per_piece(table))
 
 
 def same_rows(table: Tensor, first: Tensor, second: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -10,9 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from tensordict import MemoryMappedTensor
 from torch import Tensor
 
+from ifo_grounding.data._spool import is_mapped, pieces, release
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import atomic_write, read_json, write_json
 
@@ -117,23 +116,15 @@ def load_folder(
 
 def _save_array(path: Path, tensor: Tensor) -> None:
     array = tensor.detach().cpu().numpy()
-    source = _file_of(tensor)
-    if source is None:
+    if not is_mapped(tensor):
         np.save(path, array, allow_pickle=False)
         return
-    # From file to file: pages of a mapping that are read count as memory of this process.
-    with path.open("wb") as target, source.open("rb") as opened:
+    with path.open("wb") as target:
         header = np.lib.format.header_data_from_array_1_0(array)
         np.lib.format.write_array_header_1_0(target, header)
-        shutil.copyfileobj(opened, target, BLOCK_BYTES)
-
-
-def _file_of(tensor: Tensor) -> Path | None:
-    """Return the file that holds a tensor and nothing else, None where there is none."""
-    if not isinstance(tensor, MemoryMappedTensor):
-        return None
-    path = Path(tensor.filename)
-    return path if path.stat().st_size == tensor.nbytes else None
+        for piece in pieces(tensor):
+            target.write(piece.numpy().data)
+            release(tensor)
 
 
 def fact(facts: Mapping[str, Any], name: str, kinds: type | tuple[type, ...]) -> Any:

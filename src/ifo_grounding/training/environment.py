@@ -6,18 +6,18 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.supervised import Metrics
+from ifo_grounding.transforms._common import exposes_state, innermost
 
 
 def check_env(env: EnvBase) -> None:
     """Refuse an env that shows the true state or pays no learned reward."""
-    base = getattr(env, "base_env", env)
-    if getattr(base, "expose_state", False):
+    if exposes_state(innermost(env)):
         raise UserError("self-examination never sees the true state: use expose_state=False")
     observed = env.observation_spec.keys(True, True)
     if keys.INSTRUCTION not in observed:
@@ -65,11 +65,12 @@ def sampler_stats(env: EnvBase) -> Metrics:
 
 
 def transforms_of(env: EnvBase) -> list[nn.Module]:
-    """Return the transforms of an env, in their order."""
-    transform = getattr(env, "transform", None)
-    if transform is None:
+    """Return the transforms around an env, the innermost first; not those inside of workers."""
+    if not isinstance(env, TransformedEnv):
         return []
-    return list(transform) if hasattr(transform, "transforms") else [transform]
+    transform = env.transform
+    own = list(transform) if isinstance(transform, Compose) else [transform]
+    return [*transforms_of(env.base_env), *own]
 
 
 def summary(batch: TensorDictBase) -> Metrics:

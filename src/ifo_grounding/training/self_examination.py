@@ -120,7 +120,8 @@ def self_examine(
 
     Args:
         env: batched, without true instructions and rewards; its transforms choose instructions
-            and write ``("next", "learned_reward")``.
+            and write ``("next", "learned_reward")``. Those around the workers of a ``SerialEnv`` or
+            ``ParallelEnv`` are seeded anew each iteration, those inside of a worker are not.
         policy: the phase-1 policy, a ``ProbabilisticActor``.
         value: estimates the learned return.
         config: algorithm and budget.

@@ -68,13 +68,7 @@ class InstructionTransform(EpisodeTransform):
 
     def check_env(self, env: EnvBase) -> None:
         """Raise :class:`UserError` where the innermost environment does not suit."""
-        if isinstance(env, BatchedEnvBase):
-            # Entries that workers' transforms carry are no true state.
-            exposed = env._supports_set_state
-        else:
-            shown = getattr(env, "expose_state", False)
-            exposed = shown or not env.state_spec.is_empty(recurse=True)
-        if exposed:
+        if exposes_state(env):
             raise UserError(
                 f"{type(self).__name__} refuses an environment that exposes its true state: a "
                 "learner must not see it. Make the environment with expose_state=False"
@@ -129,9 +123,21 @@ class InstructionTransform(EpisodeTransform):
 def base_of(transform: Transform) -> EnvBase | None:
     """Innermost environment around a transform, None where there is none."""
     env = transform.container
+    return None if env is None else innermost(env)
+
+
+def innermost(env: EnvBase) -> EnvBase:
+    """Return the environment that all transforms of ``env`` are around."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
+
+
+def exposes_state(env: EnvBase) -> bool:
+    """Tell whether an environment without transforms shows its true state, or can be set to one."""
+    if isinstance(env, BatchedEnvBase):
+        return env._supports_set_state  # entries that workers' transforms carry are no true state
+    return getattr(env, "expose_state", False) or not env.state_spec.is_empty(recurse=True)
 
 
 def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:
