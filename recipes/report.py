@@ -57,8 +57,8 @@ def report(options: DictConfig) -> Path:
     run = open_run(options)
     results = evaluate(options)
     world = open_world(options)
-    pictures: dict[str, Any] = episode_pictures(run, world)
-    if world.oracle and (run / CLASSIFIER).exists():
+    pictures: dict[str, Any] = episode_pictures(run, world, results)
+    if "suitability" in results:
         pictures["Chosen instructions"] = instruction_cases(
             load_network(run, CLASSIFIER, "train_instruction", options),
             world.task,
@@ -88,13 +88,13 @@ def scenes_of(options: DictConfig) -> str:
     return stream if split == "all" else f"{stream}, {split} instructions"
 
 
-def episode_pictures(run: Run, world: World) -> dict[str, Any]:
+def episode_pictures(run: Run, world: World, results: dict[str, Any]) -> dict[str, Any]:
     """Animate episodes: scenes that phase 2 gained and lost, or some of phase 1."""
     found: dict[str, Any] = {}
     policies = [
         load_network(run, file, "imitate", world.options)
-        for file in POLICIES
-        if (run / file).exists()
+        for phase, file in enumerate(POLICIES, 1)
+        if f"phase{phase}" in results
     ]
     where = evaluation_scenes(world.options)
     drawn: dict[str, Any] = {"actions": world.actions}
@@ -124,7 +124,7 @@ def step_by_step(
     judges = {
         name: load_network(run, file, recipe, world.options)
         for name, file, recipe in (("action", REWARD, "train_reward"), ("goal", GOAL, "train_goal"))
-        if (run / file).exists()
+        if run.is_current(recipe)
     }
     place, shown = world.pictured(scenes, **evaluation_scenes(world.options))
     words = load_demonstrations(run).vocabulary
@@ -141,7 +141,7 @@ def curves(run: Run) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for stage, (title, wanted) in CURVES.items():
         path = run / "metrics" / f"{stage}.json"
-        if not path.exists():
+        if not path.exists() or not run.is_current(stage):
             continue
         history = read_json(path)
         metrics = {

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+import pickle
 from functools import partial
 
 import numpy as np
@@ -501,3 +503,28 @@ def test_bad_resets_are_refused():
         env.reset(set_state=True)
     with pytest.raises(UserError, match="needs an instruction beside the state"):
         env.reset(env.reset().exclude("instruction"), set_state=True)
+
+
+def moved(env):
+    assert str(env.to("cpu:0").simulator.device) == "cpu:0"
+    return env
+
+
+@pytest.mark.parametrize(
+    "change", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), moved]
+)
+def test_a_copied_or_moved_env_goes_on(change):
+    """Also where both run side by side, and what they are asked is judged."""
+    actions = torch.randint(6, (40, 64), generator=torch.Generator().manual_seed(0))
+    env = PickAndPlaceEnv("pick", 64, seed=3)
+    shown = env.reset()
+    for action in actions:
+        shown = env.step_and_maybe_reset(shown.set("action", action))[1]
+    other = change(copy.deepcopy(env))
+    ahead = shown.clone()
+    for action in actions:
+        step, shown = env.step_and_maybe_reset(shown.set("action", action))
+        same, ahead = other.step_and_maybe_reset(ahead.set("action", action))
+        assert (step == same).all()
+        wanted = env.simulator.wanted.clone(), other.simulator.wanted.clone()
+        assert (wanted[0] == wanted[1]).all()

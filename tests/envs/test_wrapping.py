@@ -1,5 +1,7 @@
 """Worlds that the project did not make, behind its keys."""
 
+import pickle
+
 import gymnasium
 import numpy as np
 import pytest
@@ -136,6 +138,19 @@ def test_processes_show_what_one_process_shows():
     apart.close()
     for key in ("pixels", "instruction", "action", ("next", "reward")):
         assert torch.equal(apart.seen[key], together.seen[key])
+
+
+def test_it_can_be_copied():
+    env = from_gymnasium(
+        "ifo_grounding/Move-v0",
+        vocabulary=VOCABULARY,
+        num_envs=2,
+        image="pixels",
+        instruction="instruction_text",
+        seed=0,
+    )
+    copied = pickle.loads(pickle.dumps(env))
+    assert (env.reset() == copied.reset()).all()
 
 
 def test_policies_and_evaluation_take_it_as_it_is():

@@ -3,6 +3,7 @@ import torch
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.training import Checkpoint, FitConfig, fingerprint
+from ifo_grounding.training.checkpoint import spent
 
 
 @pytest.fixture
@@ -36,6 +37,30 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path, layer):
     Checkpoint(path, "one", layer=layer).save({})
     with pytest.raises(UserError, match="other settings"):
         Checkpoint(path, "two", layer=layer).load()
+
+
+def test_a_checkpoint_of_other_parts_is_refused(tmp_path, layer):
+    path = tmp_path / "run.pt"
+    Checkpoint(path, "a", layer=layer).save({})
+    with pytest.raises(UserError, match="holds layer, here there is guard, layer"):
+        Checkpoint(path, "a", layer=layer, guard=layer).load()
+    with pytest.raises(UserError, match="holds another layer than this run has"):
+        Checkpoint(path, "a", layer=torch.nn.Linear(2, 2)).load()
+
+
+def test_time_is_counted_from_before_an_interruption(tmp_path, layer, monkeypatch):
+    path, clock = tmp_path / "run.pt", [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    checkpoint = Checkpoint(path, "a", layer=layer)
+    clock[0] = 107.0
+    checkpoint.save({})
+    clock[0] = 500.0
+    resumed = Checkpoint(path, "a", layer=layer)
+    resumed.load()
+    clock[0] = 503.0
+    resumed.save({})
+    assert spent(path) == 10.0
+    assert spent(tmp_path / "none.pt") == 0.0
 
 
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])

@@ -3,7 +3,7 @@ import csv
 import pytest
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.training import Run
+from ifo_grounding.training import Checkpoint, Run
 
 
 def test_a_stage_is_done_once_per_settings(tmp_path):
@@ -87,3 +87,36 @@ def test_a_run_takes_over_what_another_has_finished(tmp_path):
     assert second.stage("count", {"to": 4}).result == {"counted": 4}
     with pytest.raises(UserError, match="no finished stages"):
         Run(tmp_path / "third").take_over(Run(tmp_path / "nowhere"))
+
+
+def test_a_stage_counts_the_time_before_a_kill(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    run = Run(tmp_path / "run")
+    stage = run.stage("train", 1)
+    for number, seconds in enumerate((20.0, 5.0)):
+        checkpoint = Checkpoint(stage.checkpoint.with_stem(f"train-{number}"), "a")
+        clock[0] += seconds
+        checkpoint.save({})
+    clock[0] = 1000.0
+    again = Run(tmp_path / "run").stage("train", 1)
+    clock[0] = 1002.0
+    again.finish({})
+    assert run.record("train")["seconds"] == 27.0
+
+
+def test_a_stage_that_is_done_anew_logs_anew(tmp_path):
+    for settings, value in ((1, 0.5), (2, 0.25)):
+        stage = Run(tmp_path / "run").stage("train", settings)
+        stage.log()({"loss": value}, 10)
+        stage.finish({})
+    (file,) = (tmp_path / "run" / "logs" / "train").rglob("*.csv")
+    assert file.read_text().split() == ["10,0.25"]
+
+
+def test_a_name_with_a_folder_is_a_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert Run("./name").folder.resolve() == tmp_path / "name"
+    assert Run(".").folder.resolve() == tmp_path
+    with pytest.raises(UserError, match="needs a name"):
+        Run("")

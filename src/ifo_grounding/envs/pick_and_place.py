@@ -115,6 +115,12 @@ class PickAndPlaceEnv(EnvBase):
         """Number of the scene that each row began with, int64 [num_envs]; -1 where it has none."""
         return self.simulator.numbers
 
+    def to(self, device: torch.device | str) -> PickAndPlaceEnv:
+        """Move the worlds, with the episodes that run in them, to a device."""
+        super().to(device)
+        self.simulator.to(self.device)
+        return self
+
     def _make_specs(self) -> None:
         batch, device = tuple(self.batch_size), self.device
         side = self.options.layout.size * self.tile_size

@@ -46,19 +46,36 @@ class Simulator:
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.numbers = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episodes: _Episodes | None = None
-        self._canvas = Canvas(tile_size)
+        self._prepare()
+        self.seed(seed)
+
+    def _prepare(self) -> None:
+        """Make what drawing needs, on the simulator's device."""
+        self._canvas = Canvas(self.tile_size)
         # Places that may have changed since all were drawn, world and cell as one number.
         self._touched: list[Tensor] | None = None  # None: any place
-        cells = options.layout.size**2
-        self._every_row = torch.arange(num_envs, device=self.device)
+        cells = self.options.layout.size**2
+        self._every_row = torch.arange(self.num_envs, device=self.device)
         self._first_cell = cells * self._every_row
         self._every_cell = torch.arange(cells, device=self.device)
-        self.seed(seed)
 
     def seed(self, seed: int) -> None:
         """Go to the first scene of the stream of this seed."""
         self.stream = SceneStream(self.options, seed, self.device)
         self.next_number = 0
+
+    def to(self, device: torch.device | str) -> Simulator:
+        """Move the running episodes and all that follow to a device."""
+        self.device = torch.device(device)
+        self.steps, self.numbers = self.steps.to(self.device), self.numbers.to(self.device)
+        if self._episodes is not None:
+            state, wanted, tokens = self.state, self.wanted, self.instruction
+            self._episodes = _Episodes(
+                state.to(self.device), wanted.to(self.device), tokens.to(self.device)
+            )
+        self._prepare()
+        self.stream = SceneStream(self.options, self.stream.seed, self.device)
+        return self
 
     @property
     def started(self) -> bool:
@@ -175,6 +192,14 @@ class _Episodes:
     def __init__(self, state: WorldState, wanted: Plan, instruction: Tensor) -> None:
         self.state, self.wanted, self.instruction = state, wanted, instruction
         self._asked = [*plan_leaves(wanted), instruction]  # written to, and never replaced
+
+    def __getstate__(self) -> tuple[WorldState, Plan, Tensor]:
+        """Return what a copy is made of. Left alone, deepcopy shares the tensors of a state."""
+        return self.state.clone(), self.wanted.clone(), self.instruction.clone()
+
+    def __setstate__(self, parts: tuple[WorldState, Plan, Tensor]) -> None:
+        """Become what was copied; what is written to has to be what is read."""
+        self.__init__(*parts)  # type: ignore[misc]
 
     def leaves(self) -> list[Tensor]:
         """Everything that episodes are made of, as of scenes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import secrets
 from collections.abc import Callable
 from typing import Any
@@ -91,10 +92,7 @@ def from_gymnasium(
     torch.Size([2, 3, 48, 48])
     """
     if isinstance(world, str):
-        name = world
-
-        def make() -> gymnasium.Env:
-            return gymnasium.make(name, **make_options)
+        make: Make = functools.partial(gymnasium.make, world, **make_options)
     elif make_options:
         raise UserError(
             f"options {sorted(make_options)} are for a world made from its id: give them to it in "
@@ -111,6 +109,10 @@ def from_gymnasium(
         stream=stream,
         device=device,
     )
+
+
+def _open(make: Make, reading: Reading) -> Read:
+    return Read(make(), reading)
 
 
 def world_seed(seed: int, stream: str, number: int) -> int:
@@ -152,7 +154,7 @@ class GymnasiumEnv(EnvBase):
             )
         super().__init__(device=device or "cpu", batch_size=[num_envs])
         vector = AsyncVectorEnv if processes else SyncVectorEnv
-        makes = [lambda: Read(make(), reading)] * num_envs
+        makes = [functools.partial(_open, make, reading)] * num_envs
         self.worlds = vector(makes, autoreset_mode=AutoresetMode.DISABLED)
         self.num_envs, self.instructed, self.stream = num_envs, reading.instructed, stream
         self.vocabulary = reading.vocabulary

@@ -121,8 +121,20 @@ class SceneStream:
         kept: int = BLOCKS_KEPT,
     ) -> None:
         self.options, self.seed = options, seed
-        self.device = torch.device(device or "cpu")
-        self._block = functools.lru_cache(maxsize=kept)(self._draw)
+        self.device, self.kept = torch.device(device or "cpu"), kept
+        self._remember()
+
+    def _remember(self) -> None:
+        self._block = functools.lru_cache(maxsize=self.kept)(self._draw)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: scenes are drawn again."""
+        return {name: value for name, value in vars(self).items() if name != "_block"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become what was copied."""
+        vars(self).update(state)
+        self._remember()
 
     def scenes(self, numbers: Tensor) -> Scene:
         """Return the scenes with the given numbers, int64 [N]."""

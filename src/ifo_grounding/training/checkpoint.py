@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+import time
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ class Checkpoint:
 
     def __init__(self, path: str | Path, settings: str, **parts: Any) -> None:
         self.path, self.settings, self.parts = Path(path), settings, parts
+        self._begun = time.monotonic()
 
     def save(self, progress: dict[str, Any]) -> None:
         """Write all parts and ``progress`` (numbers, strings, lists, dicts, tensors)."""
@@ -59,6 +61,7 @@ class Checkpoint:
             "format": FORMAT,
             "settings": self.settings,
             "progress": progress,
+            "seconds": time.monotonic() - self._begun,
             "parts": {name: part.state_dict() for name, part in self.parts.items()},
         }
         with atomic_write(self.path) as temporary:
@@ -68,26 +71,56 @@ class Checkpoint:
         """Restore all parts and return the progress, or None where there is no checkpoint.
 
         Raises:
-            UserError: where the file is damaged, foreign, or of a run with other settings.
+            UserError: where the file is damaged, foreign, or of a run with other settings or parts.
         """
         if not self.path.exists():
             return None
-        try:
-            content = torch.load(self.path, map_location="cpu", weights_only=True)
-        except (RuntimeError, EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
-            reason = (str(error) or type(error).__name__).splitlines()[0]
-            raise UserError(f"{self.path} is damaged ({reason}): delete it to start over") from None
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise UserError(f"{self.path} is no checkpoint of this library: delete it")
+        content = _read(self.path)
         if content["settings"] != self.settings:
             raise UserError(
                 f"{self.path} belongs to a run with other settings: give this run another name, "
                 "restore the settings, or delete the checkpoint to start over"
             )
+        held, wanted = set(content["parts"]), set(self.parts)
+        if held != wanted:
+            raise UserError(
+                f"{self.path} holds {', '.join(sorted(held))}, here there is "
+                f"{', '.join(sorted(wanted))}: give this run another name, go on with the same "
+                "parts, or delete the checkpoint to start over"
+            )
         for name, part in self.parts.items():
-            part.load_state_dict(content["parts"][name])
+            try:
+                part.load_state_dict(content["parts"][name])
+            except (KeyError, RuntimeError, TypeError, ValueError) as error:
+                raise UserError(
+                    f"{self.path} holds another {name} than this run has ({_reason(error)}): give "
+                    "this run another name, or delete the checkpoint to start over"
+                ) from error
+        self._begun = time.monotonic() - content.get("seconds", 0.0)
         return content["progress"]
 
     def delete(self) -> None:
         """Remove the file, if there is one."""
         self.path.unlink(missing_ok=True)
+
+
+def spent(path: str | Path) -> float:
+    """Return the seconds of work that a checkpoint holds, 0 where it cannot be read."""
+    try:
+        return float(_read(Path(path), mmap=True).get("seconds", 0.0))
+    except UserError:  # whoever continues from it says what is wrong
+        return 0.0
+
+
+def _read(path: Path, mmap: bool = False) -> dict[str, Any]:
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+    except (RuntimeError, EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
+        raise UserError(f"{path} is damaged ({_reason(error)}): delete it to start over") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise UserError(f"{path} is no checkpoint of this library: delete it")
+    return content
+
+
+def _reason(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import Any
 
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json, write_json
-from ifo_grounding.training.checkpoint import fingerprint
+from ifo_grounding.training.checkpoint import fingerprint, spent
 from ifo_grounding.training.supervised import Log, Metrics
 
 EXTRAS = ("tensorboard", "wandb")
@@ -25,11 +26,11 @@ class Run:
 
     Args:
         name: name of the run under the home folder (see :func:`ifo_grounding.files.home`), or a
-            path to a folder anywhere.
+            path to a folder anywhere, such as ``./name``.
         logger: ``csv``, ``tensorboard``, ``wandb`` or ``none``: where metrics go while training.
 
     Raises:
-        UserError: on a logger that is unknown or not installed.
+        UserError: on a logger that is unknown or not installed, or an empty name.
 
     >>> import tempfile
     >>> run = Run(tempfile.mkdtemp())
@@ -49,10 +50,11 @@ class Run:
                 f"logger={logger} needs the extra of that name: "
                 f"pip install 'ifo-grounding[{logger}]', or use logger=csv"
             )
-        given = Path(name).expanduser()
-        self.folder = (
-            given if given.is_absolute() or len(given.parts) > 1 else home() / "runs" / name
-        )
+        given = os.path.expanduser(name)
+        if not given:
+            raise UserError("a run needs a name, or the path of its folder")
+        named = not os.path.dirname(given) and given not in (os.curdir, os.pardir)
+        self.folder = home() / "runs" / given if named else Path(given)
         self.logger = logger
 
     def __truediv__(self, name: str) -> Path:
@@ -137,8 +139,9 @@ class Stage:
         if record.get("settings") == settings:
             self.result = record["result"]
         self.checkpoint = run.folder / "checkpoints" / f"{name}.pt"
-        self._continues = any(path.exists() for path in self.checkpoints())
-        self._start = time.monotonic()
+        left = [path for path in self.checkpoints() if path.exists()]
+        self._continues = bool(left)
+        self._start = time.monotonic() - (sum(map(spent, left)) if self.result is None else 0.0)
 
     def checkpoints(self) -> list[Path]:
         """Return the checkpoint and those beside it, named after it with a dash."""
@@ -171,6 +174,8 @@ class Stage:
         from torchrl.record.loggers import get_logger
 
         folder = self.run.folder / "logs"
+        if not self._continues and self.run.logger != "wandb":
+            shutil.rmtree(folder / self.name, ignore_errors=True)  # of other settings
         logged = _last_step(folder / self.name) if self._continues else -1
         options = (
             {"wandb_kwargs": {"project": "ifo-grounding"}} if self.run.logger == "wandb" else {}
