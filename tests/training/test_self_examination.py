@@ -272,8 +272,8 @@ def test_envs_that_leak_or_lack_something_are_refused():
     policy, value = make_networks()
     with pytest.raises(UserError, match="never sees the true state"):
         self_examine(simulator(expose_state=True), policy, value, config(), seed=0)
+    worlds = SerialEnv(2, lambda: simulator(4, expose_state=True))
     with pytest.raises(UserError, match="never sees the true state"):
-        worlds = SerialEnv(2, lambda: simulator(4, expose_state=True))
         self_examine(worlds, policy, value, config(), seed=0)
     with pytest.raises(UserError, match="no instructions"):
         self_examine(simulator(), policy, value, config(), seed=0)

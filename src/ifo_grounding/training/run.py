@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import importlib.util
-import os
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -50,11 +49,11 @@ class Run:
                 f"logger={logger} needs the extra of that name: "
                 f"pip install 'ifo-grounding[{logger}]', or use logger=csv"
             )
-        given = os.path.expanduser(name)
-        if not given:
+        if not str(name):
             raise UserError("a run needs a name, or the path of its folder")
-        named = not os.path.dirname(given) and given not in (os.curdir, os.pardir)
-        self.folder = home() / "runs" / given if named else Path(given)
+        given = Path(name).expanduser()
+        is_path = len(given.parts) != 1 or str(name).startswith((".", "~", "/"))
+        self.folder = given if is_path else home() / "runs" / given
         self.logger = logger
 
     def __truediv__(self, name: str) -> Path:
