@@ -41,8 +41,24 @@ RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
 """Options that decide no result."""
 
 
+AT_LEAST_ONE = (
+    "threads",
+    "imitate.trials",
+    "imitate.trial_steps",
+    "instruction.trials",
+    "instruction.trial_steps",
+)
+
+
 def open_run(options: DictConfig) -> Run:
     """Return the run of these options, with torch's threads and memory set."""
+    for name in AT_LEAST_ONE:
+        if (number := OmegaConf.select(options, name)) is not None and number < 1:
+            raise UserError(f"{name} must be at least 1, got {number}")
+    if (share := options.imitate.held_out) >= 1 or share < 0:
+        raise UserError(
+            f"imitate.held_out is a share of the demonstrations, in [0, 1), got {share}"
+        )
     if str(options.device).startswith("cuda") and not torch.cuda.is_available():
         raise UserError(f"device={options.device}: torch sees no GPU here; use device=cpu")
     keep_freed_memory()

@@ -24,6 +24,7 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import babyai
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json
+from ifo_grounding.tasks import TASKS
 
 GOAL = "goal-pairs-5000"
 """Phase 2 paid for the goal, of the preset whose own phase 2 is paid for actions."""
@@ -105,6 +106,10 @@ def pieces(options: DictConfig) -> list[list[Piece]]:
         raise UserError(
             "name a table=2, 3 or 4, a figure=5 or 6, of the paper, ablation=all or level=all"
         )
+    for task in options.tasks:
+        check_choice("task", task, TASKS)
+    if options.jobs < 1:
+        raise UserError(f"jobs must be at least 1, got {options.jobs}")
     found = table_chains(options) if asked & {"table", "figure"} else []
     found += ablation_chains(options) if "ablation" in asked else []
     return found + (level_chains(options) if "level" in asked else [])

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from _results import keep_result, write_result
-from _shared import open_run, open_stage
+from _shared import changed_networks, open_run, open_stage
 from _worlds import open_world
 from collect_transitions import collect
 from evaluate import evaluation_scenes
@@ -157,11 +157,11 @@ def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
 def beginning(name: str, options: DictConfig, seed: int) -> ImitationLoss:
     """Build a variant with the initial weights of a seed."""
     world = open_world(options).simulator()
+    chosen = {"seed": seed, "device": options.device, **changed_networks(options)}
     if name in SENTENCES:
         what = SENTENCES[name]
-        policy = make_policy(world, "film", seed=seed, device=options.device, **what.network)
-        return what.loss(policy)
-    loss = ImitationLoss(make_policy(world, "strong", seed=seed, device=options.device))
+        return what.loss(make_policy(world, "film", **{**chosen, **what.network}))
+    loss = ImitationLoss(make_policy(world, "strong", **chosen))
     if name in CHANGES:
         trunk = trunk_of(loss.network)
         assert isinstance(trunk, GroundedTrunk)

@@ -109,6 +109,7 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
         (["nested=3"], "'nested' is a section: set one of its options with nested.name=value"),
         (["preset=huge"], "unknown preset 'huge': choose one of paper, strong"),
         (["task=a,b"], "option 'task' got several values: add --multirun to run each"),
+        (["+nested.rat=1"], "unknown option 'nested.rat' (did you mean 'rate'?)"),
         (["task"], "cannot read 'task': options are written name=value"),
         (["task=[a"], "cannot read 'task=[a': options are written name=value"),
         (["--tsk"], "unknown flag '--tsk': options are written name=value; see --help"),

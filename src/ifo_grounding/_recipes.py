@@ -11,6 +11,7 @@ import os
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 USAGE_ERROR = 2
 INTERRUPTED = 130
 _TAKES = {bool: "true or false", int: "a whole number", float: "a number", list: "a list"}
+_NUMBERS = ("prior", "checkpoint_seconds")
+"""Options that take any number, though their values so far are whole."""
+_ALSO = {"pairs": None, "removal_rate": "estimated"}
+"""What options of numbers take, too."""
 
 
 def recipes_folder() -> Path:
@@ -198,23 +203,48 @@ def _check_choices(override: Override, allowed: list[str]) -> None:
 def _check_value(defaults: DictConfig, override: Override, choices: list[str]) -> None:
     from omegaconf import OmegaConf
 
-    if override.is_add() or override.is_force_add():
-        return
     key = override.key_or_group
+    if override.is_add() or override.is_force_add():
+        _check_added(key)
+        return
     section, name = _locate(defaults, key, choices)
     if override.is_delete() or override.is_sweep_override():
         return
     if OmegaConf.is_missing(section, name) or OmegaConf.is_interpolation(section, name):
         return  # what is required or composed of other options has no kind of its own
     default, given = section[name], override.value()
-    kind = list if OmegaConf.is_list(default) else type(default)
+    kind = list if OmegaConf.is_list(default) else float if name in _NUMBERS else type(default)
     if OmegaConf.is_dict(default) and not isinstance(given, dict):
         listed = ", ".join(map(str, default))
         raise UserError(
             f"{key!r} is a section: set one of its options with {key}.name=value ({listed})"
         )
+    if name in _ALSO and given == _ALSO[name]:
+        return
     if kind in _TAKES and not _fits(given, kind):
-        raise UserError(f"option {key!r} takes {_TAKES[kind]}, not {given!r}")
+        also = f" or {_ALSO[name] or 'null'}" if name in _ALSO else ""
+        raise UserError(f"option {key!r} takes {_TAKES[kind]}{also}, not {given!r}")
+
+
+def _check_added(key: str) -> None:
+    """Refuse to add to a section what no options and no part of the library have a name for."""
+    from omegaconf import OmegaConf
+
+    from ifo_grounding.networks import NetworkConfig
+    from ifo_grounding.training import FitConfig, SelfExaminationConfig
+
+    section, _, name = key.partition(".")
+    if not name or "." in name:
+        return
+    kinds = (NetworkConfig, FitConfig, SelfExaminationConfig)
+    known = {each.name for kind in kinds for each in fields(kind)}
+    for file in (recipes_folder() / "conf").rglob("*.yaml"):
+        options = OmegaConf.select(OmegaConf.load(file), section)
+        known |= set(map(str, options)) if OmegaConf.is_dict(options) else set()
+    if name not in known:
+        close = difflib.get_close_matches(name, sorted(known), n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise UserError(f"unknown option {key!r}{hint}: nothing would read it")
 
 
 def _fits(given: Any, kind: type) -> bool:

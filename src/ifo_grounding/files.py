@@ -41,8 +41,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         yield temporary
         if temporary.is_dir() and path.is_dir():
             retired = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old")
-            os.replace(path, retired)
-            os.replace(temporary, path)
+            try:
+                os.replace(path, retired)
+                os.replace(temporary, path)
+            finally:  # interrupted between the two, the old one comes back
+                if retired.exists() and not path.exists():
+                    os.replace(retired, path)
             shutil.rmtree(retired)
         else:
             os.replace(temporary, path)

@@ -138,10 +138,17 @@ def test_levels_of_babyai_are_pieces_by_number_of_demonstrations(options, tmp_pa
 def test_a_piece_that_fails_ends_its_chain(options):
     from reproduce import reproduce
 
-    asked = options("table=3", "tasks=[juggle, move]", "presets=[strong]", "jobs=1", "seeds=[1]")
+    asked = options(
+        "table=3",
+        "tasks=[pick, move]",
+        "presets=[strong]",
+        "jobs=1",
+        "seeds=[1]",
+        "+options_of.preset_of_task.strong={pick: {imitate: {trials: 0}}}",
+    )
     (failed,) = reproduce(asked)
-    assert "juggle" in failed.log.read_text()
-    assert failed.run == "tables-juggle-strong-phase-1-seed1"
+    assert "imitate.trials must be at least 1" in failed.log.read_text()
+    assert failed.run == "tables-pick-strong-phase-1-seed1"
 
 
 def test_listing_runs_nothing(options, capsys):
@@ -160,6 +167,8 @@ def test_listing_runs_nothing(options, capsys):
     [
         ([], "name a table"),
         (["table=7"], "table"),
+        (["table=2", "tasks=[mvoe]"], "mvoe"),
+        (["table=2", "jobs=0"], "jobs must be at least 1"),
         (["table=2", "presets=[huge]"], "huge"),
         (["ablation=gravity"], "gravity"),
         (["ablation=all", "tasks=[pick]"], "move, pick-out alone"),

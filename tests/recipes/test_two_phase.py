@@ -215,3 +215,36 @@ def test_the_papers_learning_rate_does_not_decay(compose, preset, schedule):
     options = compose("two_phase", f"preset={preset}")
     for section in ("inverse", "imitate", "instruction", "reward", "goal"):
         assert fit_config(options[section]).schedule == schedule
+
+
+def test_a_report_leaves_out_what_is_not_there_or_of_another_phase_1(compose, tmp_path):
+    from imitate import imitate
+    from two_phase import train_phases
+
+    from report import report
+
+    train_phases(compose("two_phase"))
+    options = compose("report", "imitate.steps=30", "evaluate.states=0")
+    imitate(options)
+    page = report(options).read_text()
+    assert "Episodes of phase 1" in page
+    assert "Imitation" in page
+    assert "Self-examination" not in page and "Chosen instructions" not in page
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("imitate.trials=0", "imitate.trials must be at least 1"),
+        ("instruction.trial_steps=0", "instruction.trial_steps must be at least 1"),
+        ("imitate.held_out=2", r"a share of the demonstrations, in \[0, 1\)"),
+        ("self_examine.select_episodes=0", "select_episodes must be at least 1"),
+        ("threads=-1", "threads must be at least 1"),
+    ],
+)
+def test_impossible_options_are_refused_before_a_run_begins(compose, tmp_path, wrong, said):
+    from two_phase import two_phase
+
+    with pytest.raises(UserError, match=said):
+        two_phase(compose("two_phase", wrong))
+    assert not (tmp_path / "run").exists()

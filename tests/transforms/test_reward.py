@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -115,6 +116,12 @@ def test_termination_can_stand_for_the_stop():
     rollout = by_flag.rollout(40, expert, break_when_any_done=False)
     paid, terminated = rollout["next", "learned_reward"], rollout["next", "terminated"]
     assert torch.allclose(paid, terminated * torch.tensor(SURE))
+
+
+@pytest.mark.parametrize("number", [np.int64(STOP), torch.tensor(STOP)])
+def test_a_stop_may_be_any_whole_number(number):
+    reward = LearnedReward(goal_judge(), kind="goal", stop_action=number)
+    assert type(reward.stop_action) is int and reward.stop_action == STOP
 
 
 def test_one_hot_actions_are_understood():
@@ -248,6 +255,7 @@ def test_beside_a_reward_sum():
         ({"kind": "goal", "form": "centred"}, "a goal pays a probability"),
         ({"weights": (1,)}, "weights are two"),
         ({"stop_action": "last"}, "unknown stop_action 'last'"),
+        ({"stop_action": 1.5}, "stop_action is the number of an action"),
         ({"arrival": 0.9}, "of the judge of goals.*kind='action'"),
         ({"kind": "goal", "arrival": 1.5}, "within 0..1, got 1.5"),
         ({"kind": "goal"}, "writes 'action_score'.* says 'goal_score'"),

@@ -84,7 +84,8 @@ class SelfExaminationConfig:
     def __post_init__(self) -> None:
         """Refuse unknown algorithms and empty budgets."""
         check_choice("algorithm", self.algorithm, ALGORITHMS)
-        for name in ("iterations", "steps", "epochs", "minibatch", "checkpoint_every"):
+        counts = ("iterations", "steps", "epochs", "minibatch", "select_episodes", "max_steps")
+        for name in (*counts, "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
 

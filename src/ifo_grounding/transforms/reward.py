@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import torch
@@ -104,6 +105,14 @@ class LearnedReward(EpisodeTransform):
             raise UserError(f"weights are two, of the action and of the goal, got {len(weights)}")
         if isinstance(stop_action, str):
             check_choice("stop_action", stop_action, (FROM_ENV,))
+        elif stop_action is not None:
+            try:
+                stop_action = operator.index(stop_action)
+            except TypeError:
+                raise UserError(
+                    f"stop_action is the number of an action, {FROM_ENV!r} or None, got "
+                    f"{stop_action!r}"
+                ) from None
         if arrival is not None and (kind == "action" or not 0.0 < arrival <= 1.0):
             raise UserError(
                 f"arrival is a probability of the judge of goals, within 0..1, got {arrival} with "
