@@ -34,6 +34,8 @@ LEARNED = PICTURE.with_name("babyai.png")
 EFFICIENCY = PICTURE.with_name("efficiency.png")
 FEW = 2000
 """Demonstrations up to which the README shows a study: with more there is little left to gain."""
+LONGER = "strong, 60-iterations"
+"""The preset that practises for longer, as a study of its own."""
 HACKED = ROOT / "results" / "study" / "move-200-film-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
@@ -98,7 +100,9 @@ def study_section() -> list[str]:
         " ([too early](#variants-of-phase-1), as it turned out)."
         " `continued` and `cloned` are the [controls](phase2.md#controls). p is that of no gain, by"
         " a [t test over seeds](evaluation.md#intervals), of one seed by McNemar's, corrected"
-        " (Holm) for the tasks with as many demonstrations.",
+        " (Holm) for the tasks with as many demonstrations. `60-iterations` practises for longer,"
+        " from the same phase 1, with 10,000 states whose instructions are"
+        " [chosen once](phase2.md#what-practice-gains-with-few).",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table([shown(row, *JUDGED) for row in rows]),
         differing_note(),
@@ -304,7 +308,7 @@ def practised(variants: bool = False) -> dict[Key, list[dict[str, Any]]]:
     return {
         key: runs
         for key, runs in studies().items()
-        if "phase2" in runs[0]["results"] and (", " in key[2]) == variants
+        if "phase2" in runs[0]["results"] and (", " in key[2] and key[2] != LONGER) == variants
     }
 
 
@@ -319,6 +323,7 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
         "preset": f"{kind}, {held_out:.0%} held out" if held_out else kind,
         "seeds": f"{len(runs)}†" if differing(runs) else len(runs),
         "scenes": f"{both[0].shape[1]:,}{stream}",
+        "iterations": runs[0]["options"]["self_examine"]["iterations"],
         "phase 1": brief(two_level_bootstrap(both[0])),
         "phase 2": brief(two_level_bootstrap(both[1])),
         "gain, points": brief(paired_difference(*both)),
@@ -344,13 +349,13 @@ def over_control(name: str, runs: list[dict[str, Any]]) -> str:
 def differing(runs: list[dict[str, Any]]) -> dict[str, list[Any]]:
     """Return the options that decide what is learned and are not those of all seeds, by seed.
 
-    Runs from before an option was there have none, which is the same as zero.
+    Runs from before an option was there have none, which is the same as zero, or as one trial.
     """
     every = [
         {
             f"{part}.{name}": value
             for part in DECISIVE
-            for name, value in run["options"].get(part, {}).items()
+            for name, value in effective(run["options"].get(part, {})).items()
         }
         for run in runs
     ]
@@ -358,6 +363,13 @@ def differing(runs: list[dict[str, Any]]) -> dict[str, list[Any]]:
     return {
         name: found for name, found in sorted(values.items()) if found.count(found[0]) < len(found)
     }
+
+
+def effective(section: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a section that have an effect."""
+    single = section.get("trials", 1) == 1
+    alone = ("trials", "trial_steps") if single else ()
+    return {name: value for name, value in section.items() if name not in alone}
 
 
 def differing_note() -> str:
@@ -397,10 +409,10 @@ def efficient() -> dict[str, dict[int, dict[str, Rate]]]:
 
     def add(task: str, n: int, runs: list[dict[str, Any]]) -> None:
         rates = {name: two_level_bootstrap(outcomes(runs, name)) for name in PHASES}
-        found.setdefault(task, {}).setdefault(n, rates)
+        found.setdefault(task, {})[n] = rates  # of what practises for longer, where both are there
 
     for (task, n, kind, held_out), runs in practised().items():
-        if kind == "strong" and not held_out:
+        if kind in ("strong", LONGER) and not held_out:
             add(task, n, runs)
     found = {task: by for task, by in found.items() if len(by) > 1}
     tabled = read_results(
@@ -501,7 +513,7 @@ def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
     aside = ("preset", "scenes", *JUDGED)
     found = zip(practised(), study_rows(), strict=True)
-    few = [row for (_, n, *_), row in found if n <= FEW and row["preset"] == "strong"]
+    few = [row for (_, n, kind, _), row in found if n <= FEW and kind in ("strong", LONGER)]
     rows = [shown(row, *aside) for row in few]
     note = "\n† made with [different options](docs/results.md#studies), by seed.\n"
     mixed = note if any("†" in str(row["seeds"]) for row in rows) else ""

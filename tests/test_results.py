@@ -60,6 +60,8 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
         results["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
         options = {"task": "pick", "demonstrations": {"n": 2000}, "network": "strong", "seed": seed}
         options["imitate"] = {"held_out": 0.0, "prior": 2000 * seed}
+        options["instruction"] = {"trials": 1, "trial_steps": 400} if seed else {}  # the same
+        options["self_examine"] = {"iterations": 20}
         if seed:
             del results["continued"]
         run = {
