@@ -184,8 +184,8 @@ def gymnasium_vector() -> Row:
     )
 
 
-def collector(preset: str) -> Row:
-    batch, steps = (1024, 20) if preset == "strong" else (512, 10)
+def collector(preset: str, batch: int) -> Row:
+    steps = 10 if preset == "paper" else 20480 // batch
     env = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
     policy = networks.make_policy(env, preset, seed=0, device=DEVICE)
     source = Collector(
@@ -211,7 +211,7 @@ def collector(preset: str) -> Row:
         return batch * steps
 
     return Row(
-        f"Collector, preset {preset}",
+        f"Collector, preset {preset}, batch {batch:,}",
         "frames/s",
         {**ours(collect), "the policy alone": timed(infer)},
         {"the policy alone": 0.8},
@@ -463,7 +463,9 @@ ROWS: dict[str, Callable[[], Row]] = {
     "pixels": world_pixels,
     "rollout": env_rollout,
     "gymnasium": gymnasium_vector,
-    **{f"collector-{preset}": functools.partial(collector, preset) for preset in PRESETS},
+    "collector-strong": functools.partial(collector, "strong", 1024),
+    "collector-strong-2048": functools.partial(collector, "strong", 2048),
+    "collector-paper": functools.partial(collector, "paper", 512),
     "sampler": sampler,
     **{f"imitation-{preset}": functools.partial(imitation, preset) for preset in PRESETS},
     "labelling": labelling,
