@@ -19,6 +19,7 @@ from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
 from ifo_grounding.errors import UserError
 from ifo_grounding.objectives import SupervisedLoss
+from ifo_grounding.report import text_table
 from ifo_grounding.seeding import derive
 from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
@@ -237,6 +238,23 @@ def fit_config(section: DictConfig) -> FitConfig:
 def self_examination_config(section: DictConfig) -> SelfExaminationConfig:
     """Return the part of a section that says how the policy is improved."""
     return SelfExaminationConfig(**_known(section, SelfExaminationConfig))
+
+
+def tell(result: dict[str, Any]) -> None:
+    """Print what a stage found, one line each."""
+    rows = [
+        {"found": name.replace("_", " "), "value": _written(value)}
+        for name, value in result.items()
+    ]
+    print(text_table(rows))
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_written, value))
+    if not isinstance(value, float):
+        return f"{value:,}" if isinstance(value, int) else str(value)
+    return f"{value:,.0f}" if value.is_integer() or abs(value) >= 1000 else f"{value:.4g}"
 
 
 def plain(node: Any) -> Any:

@@ -1,6 +1,6 @@
 """Step the simulator at random: what the inverse module learns from (paper, 1st-phase)."""
 
-from _shared import RANDOM_STEPS, open_stage, shows_progress
+from _shared import RANDOM_STEPS, open_stage, shows_progress, tell
 from _worlds import open_world
 from omegaconf import DictConfig
 
@@ -29,7 +29,7 @@ def collect(options: DictConfig) -> dict:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(collect(options))
+    tell(collect(options))
 
 
 if __name__ == "__main__":

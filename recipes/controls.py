@@ -11,6 +11,7 @@ from _shared import (
     load_network,
     open_stage,
     self_examination_config,
+    tell,
     train,
 )
 from imitate import labelled_demonstrations
@@ -139,7 +140,8 @@ def run_controls(options: DictConfig) -> list[dict]:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(*run_controls(options), sep="\n")
+    for result in run_controls(options):
+        tell(result)
 
 
 if __name__ == "__main__":

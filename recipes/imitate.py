@@ -9,6 +9,7 @@ from _shared import (
     load_demonstrations,
     load_labels,
     open_stage,
+    tell,
 )
 from _worlds import build, context_of
 from omegaconf import DictConfig
@@ -84,7 +85,7 @@ def split_transitions(
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(imitate(options))
+    tell(imitate(options))
 
 
 if __name__ == "__main__":

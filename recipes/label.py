@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import Truth, label_demonstrations
 from ifo_grounding.evaluation import label_accuracy
+from ifo_grounding.report import results_table
 
 
 def label(options: DictConfig) -> dict:
@@ -34,7 +35,7 @@ def label(options: DictConfig) -> dict:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(label(options)["accuracy"])
+    print(results_table({"labels": label(options)["accuracy"]}))
 
 
 if __name__ == "__main__":

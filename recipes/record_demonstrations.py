@@ -1,6 +1,6 @@
 """Record demonstrations: frames and instructions, never actions."""
 
-from _shared import DEMONSTRATIONS, TRUTH, open_stage, shows_progress
+from _shared import DEMONSTRATIONS, TRUTH, open_stage, shows_progress, tell
 from _worlds import open_world
 from omegaconf import DictConfig
 
@@ -22,7 +22,7 @@ def record(options: DictConfig) -> dict:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(record(options))
+    tell(record(options))
 
 
 if __name__ == "__main__":

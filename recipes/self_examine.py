@@ -16,6 +16,7 @@ from _shared import (
     practised_pool,
     self_examination_config,
     shows_progress,
+    tell,
 )
 from _worlds import build, context_of, open_world
 from imitate import labelled_demonstrations
@@ -151,7 +152,7 @@ def chosen_starts(run: Run, options: DictConfig) -> InstructionSampler | Startin
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(examine(options))
+    tell(examine(options))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Train the goal judge: whether an instruction is fulfilled (an extension of the paper)."""
 
-from _shared import GOAL, load_demonstrations, open_stage, starting_policy, train
+from _shared import GOAL, load_demonstrations, open_stage, starting_policy, tell, train
 from _worlds import build, context_of
 from omegaconf import DictConfig
 
@@ -29,7 +29,7 @@ def train_goal(options: DictConfig) -> dict:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(train_goal(options))
+    tell(train_goal(options))
 
 
 if __name__ == "__main__":

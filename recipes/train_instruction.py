@@ -10,6 +10,7 @@ from _shared import (
     load_demonstrations,
     open_stage,
     starting_policy,
+    tell,
 )
 from _worlds import build, context_of, open_world
 from omegaconf import DictConfig
@@ -101,7 +102,7 @@ def fresh_states(options: DictConfig, demonstrations: int) -> Tensor | None:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(train_instruction(options))
+    tell(train_instruction(options))
 
 
 if __name__ == "__main__":

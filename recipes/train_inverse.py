@@ -1,6 +1,6 @@
 """Train the inverse module: which action lies between two frames (paper, 1st-phase)."""
 
-from _shared import INVERSE, RANDOM_STEPS, open_stage, train
+from _shared import INVERSE, RANDOM_STEPS, open_stage, tell, train
 from _worlds import build
 from omegaconf import DictConfig
 
@@ -21,7 +21,7 @@ def train_inverse(options: DictConfig) -> dict:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(train_inverse(options))
+    tell(train_inverse(options))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from _shared import (
     load_labels,
     open_stage,
     starting_policy,
+    tell,
     train,
 )
 from _worlds import build, context_of
@@ -31,7 +32,7 @@ def train_reward(options: DictConfig) -> dict:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(train_reward(options))
+    tell(train_reward(options))
 
 
 if __name__ == "__main__":

@@ -248,3 +248,12 @@ def test_impossible_options_are_refused_before_a_run_begins(compose, tmp_path, w
     with pytest.raises(UserError, match=said):
         two_phase(compose("two_phase", wrong))
     assert not (tmp_path / "run").exists()
+
+
+def test_a_stage_says_what_it_found_line_by_line(compose, capsys):
+    from _shared import tell
+
+    tell({"taken": [1200, 3.0], "grad_norm": 0.87186746, "samples_per_second": 11786.6, "to": "x"})
+    _, _, *lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[-1] for line in lines] == ["3", "0.8719", "11,787", "x"]
+    assert lines[0].split() == ["taken", "1,200,", "3"]
