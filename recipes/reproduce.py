@@ -72,11 +72,7 @@ class Piece:
         ):
             today = flat(compose("study", overrides=list(self.arguments)))
         then = flat(read_json(self.file)["options"])
-        return [
-            f"{name}={then.get(name, 'unknown')} (now {today.get(name, 'unknown')})"
-            for name in sorted(then.keys() | today.keys())
-            if then.get(name, "unknown") != today.get(name, "unknown") and name not in RUNNING
-        ]
+        return list(differences(then, today))
 
     def make(self) -> int:
         """Make it in a process of its own, at one thread; what it prints goes to a file."""
@@ -239,6 +235,21 @@ def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any
         full = above + name
         found |= flat(value, f"{full}.") if isinstance(value, dict) else {full: value}
     return found
+
+
+def differences(then: dict[str, Any], today: dict[str, Any]) -> Iterator[str]:
+    """Say which options are others today; one that was not there did nothing."""
+    single = {name for name, value in today.items() if name.endswith(".trials") and value == 1}
+    idle = {*RUNNING, *single, *(name.replace("trials", "trial_steps") for name in single)}
+    if not today.get("controls.run"):
+        idle |= {name for name in today if name.startswith("controls.")}
+    for name in sorted((then.keys() | today.keys()) - idle):
+        if name not in today:
+            yield f"{name}={then[name]} (now there is none)"
+        elif name not in then and today[name]:
+            yield f"no {name} (now {today[name]})"
+        elif name in then and then[name] != today[name]:
+            yield f"{name}={then[name]} (now {today[name]})"
 
 
 def to_make(chain: list[Piece]) -> list[Piece]:

@@ -49,11 +49,16 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     assert second.changed() == []
     stored = read_json(second.file)
     stored["options"]["instruction"]["candidates"] += 1
+    del stored["options"]["instruction"]["fresh_states"], stored["options"]["imitate"]["prior"]
     write_json(second.file, stored)
     assert reproduce(options("figure=6", "tasks=[move]", "presets=[strong]", "list=true")) == []
     *_, listed, noted = capsys.readouterr().out.splitlines()
     assert listed == f"done    {second.file}"
-    assert noted.strip().startswith("made with instruction.candidates=")
+    assert [each.split()[-3:] for each in noted.strip().split(", ")] == [
+        ["imitate.prior", "(now", "2000)"],
+        ["instruction.candidates=17", "(now", "16)"],
+        ["instruction.fresh_states", "(now", "4096)"],
+    ]
 
     written = second.file.stat().st_mtime_ns
     assert reproduce(asked) == []
