@@ -101,8 +101,8 @@ def _remove(path: Path, process: int) -> None:
 
 
 def is_mapped(table: Tensor) -> bool:
-    """Tell whether a table begins what a :class:`Spool` keeps in a file."""
-    return table.data_ptr() in _MAPPINGS
+    """Tell whether a table is the beginning of what a :class:`Spool` keeps in a file."""
+    return table.data_ptr() in _MAPPINGS and table.is_contiguous()
 
 
 def release(table: Tensor) -> None:
