@@ -53,9 +53,11 @@ CURVES = {
 EPISODES, TRACED = 4, 2
 
 
-def report(options: DictConfig) -> Path:
+def report(options: DictConfig, results: dict[str, Any] | None = None) -> Path:
+    """Write the page of a run, of what :func:`evaluate` has just returned or will return now."""
     run = open_run(options)
-    results = evaluate(options)
+    if results is None:
+        results = evaluate(options)
     world = open_world(options)
     pictures: dict[str, Any] = episode_pictures(run, world, results)
     if "suitability" in results:

@@ -66,7 +66,7 @@ def train_phases(options: DictConfig) -> None:
 @recipe_main
 def main(options: DictConfig) -> None:
     results = two_phase(options)
-    page = report(options)
+    page = report(options, results)
     print(f"\n{results_table(results)}\n\nrun: {open_run(options).folder}\nreport: {page}")
 
 
