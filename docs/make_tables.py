@@ -237,7 +237,8 @@ def content() -> str:
         " paper's reward is paid for every action, and discounted here as the goal reward is: a"
         " policy then earns most that never stops"
         " ([an example](phase2.md#an-example-of-a-reward-that-is-exploited)). Preset `paper`"
-        " credits each action with its own reward alone.",
+        " credits each action with its own reward alone. Random instructions still teach `move`,"
+        " where every third suits by chance, and mislead `pick-out`, where hardly any does.",
         ablation_content(),
     ]
     return "\n\n".join(part for part in parts if part)
