@@ -204,7 +204,8 @@ def imitation_section() -> list[str]:
     return [
         "## Variants of phase 1",
         "When to [stop imitating](phase1.md#when-to-stop), and with and without the"
-        " [prior](phase1.md#few-demonstrations): success on 4,000 validation scenes.",
+        " [prior](phase1.md#few-demonstrations), in batches of other sizes: success on 4,000 or"
+        " 5,000 validation scenes.",
         markdown_table(rows),
         commands_note(found.values()),
     ]
