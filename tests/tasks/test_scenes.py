@@ -15,6 +15,7 @@ from ifo_grounding.tasks import (
     SceneOptions,
     SceneStream,
     grammar,
+    streams,
     suitable,
 )
 from ifo_grounding.tasks import scenes as module
@@ -63,21 +64,21 @@ def test_a_number_names_one_scene_in_any_order():
 def test_chunks_that_are_drawn_side_by_side_are_those_drawn_alone(monkeypatch, options):
     together = first(3 * CHUNK, **options)
     monkeypatch.setattr(module, "AHEAD", 1)
-    monkeypatch.setattr(module, "BLOCK", CHUNK)
+    monkeypatch.setattr(streams, "BLOCK", CHUNK)
     assert same(together, first(3 * CHUNK, **options))
 
 
 @pytest.mark.parametrize("task", ["move", "pick"])
 def test_looking_at_fewer_draws_than_it_takes_changes_no_scene(task, monkeypatch):
     expected = first(CHUNK, task=task)
-    enough = SceneStream._propose_enough
+    enough = module._propose_enough
     asked = []
 
-    def few(self, draws, missing, needed):
+    def few(options, draws, missing, needed):
         asked.append(needed)
-        return enough(self, draws, missing, min(needed, 40))
+        return enough(options, draws, missing, min(needed, 40))
 
-    monkeypatch.setattr(SceneStream, "_propose_enough", few)
+    monkeypatch.setattr(module, "_propose_enough", few)
     monkeypatch.setattr(module, "ROUNDS_HELD", 2)
     assert same(first(CHUNK, task=task), expected)
     assert asked[0] == CHUNK
@@ -87,7 +88,7 @@ def test_looking_at_fewer_draws_than_it_takes_changes_no_scene(task, monkeypatch
 def test_scenes_are_written_to_rows_of_others():
     stream = SceneStream(SceneOptions("pick-out"), seed=0)
     others = stream.scenes(torch.arange(10)).clone()
-    numbers, rows = torch.tensor([7, module.BLOCK + 3, 100]), torch.tensor([9, 0, 4])
+    numbers, rows = torch.tensor([7, streams.BLOCK + 3, 100]), torch.tensor([9, 0, 4])
     expected = others.clone()
     expected[rows] = stream.scenes(numbers)
     stream.write(numbers, module.scene_leaves(others), rows)

@@ -18,7 +18,8 @@ from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
 from ifo_grounding.tasks.goals import MAX_STEPS
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
+from ifo_grounding.tasks.scenes import Scene, SceneOptions
+from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import Layout, step
 from ifo_grounding.world.tiles import TILE_SIZES, tile_index, tile_table

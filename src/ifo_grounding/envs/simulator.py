@@ -11,11 +11,11 @@ from ifo_grounding.tasks.goals import Plan, fulfilled
 from ifo_grounding.tasks.scenes import (
     Scene,
     SceneOptions,
-    SceneStream,
     plan_leaves,
     scene_leaves,
     state_leaves,
 )
+from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.world import Canvas, WorldState, render, step
 
 MOST_REMEMBERED = 8

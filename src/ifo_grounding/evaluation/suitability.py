@@ -16,7 +16,8 @@ from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Estimate, Rate, auc, reliability, wilson
 from ifo_grounding.tasks.goals import REASONS, Goal, verdict
 from ifo_grounding.tasks.grammar import FIELDS, grammar
-from ifo_grounding.tasks.scenes import SceneOptions, SceneStream
+from ifo_grounding.tasks.scenes import SceneOptions
+from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.transforms.choosing import PoolScorer, choose_instructions
 from ifo_grounding.world import WorldState, render

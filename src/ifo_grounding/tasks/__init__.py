@@ -14,7 +14,8 @@ from ifo_grounding.tasks.goals import (
     verdict,
 )
 from ifo_grounding.tasks.grammar import HOLDOUTS, N_TEMPLATES, PHRASINGS, SPLITS, Grammar, grammar
-from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
+from ifo_grounding.tasks.scenes import Scene, SceneOptions
+from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 
 __all__ = [

@@ -1,12 +1,7 @@
-"""Numbered scenes: every number is one fixed initial state, with a suitable goal where asked for.
-
-A stream of scenes is a function of its seed and name, so that a scene can be drawn again by its
-number, training and evaluation never meet, and results can name the scenes that they are about.
-"""
+"""Scenes: initial states, each with a suitable goal where asked for, and how blocks are drawn."""
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
@@ -35,8 +30,6 @@ CHUNK = 1024
 """Scenes that one generator draws."""
 AHEAD = 8
 """Chunks that are drawn side by side, in half as long as one after another."""
-BLOCK = AHEAD * CHUNK
-BLOCKS_KEPT = 64
 ROUNDS_HELD = 8
 """Rounds of draws after which what was refused is let go of, for memory's sake."""
 PATIENCE = 1000
@@ -97,157 +90,84 @@ STATE_LEAVES = tuple(each.name for each in fields(WorldState))
 PLAN_LEAVES = tuple(each.name for each in fields(Plan))
 
 
-class SceneStream:
-    """The scenes of one seed, by number.
+def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
+    """Draw the scenes of several chunks on the CPU, so that every device gets the same ones.
+
+    Raises:
+        UserError: where hardly any scene has a suitable goal.
+    """
+    numbers = range(block * AHEAD, (block + 1) * AHEAD)
+    draws = [generator(seed, "scenes", options.stream, number) for number in numbers]
+    missing = torch.full((AHEAD,), CHUNK)
+    needed = CHUNK
+    proposed: list[_Proposal] = []
+    rows: list[Tensor] = []
+    owners: list[Tensor] = []
+    for _ in range(PATIENCE):
+        unfinished = missing.nonzero().squeeze(-1)
+        sources = [draws[chunk] for chunk in unfinished]
+        proposal, good = _propose_enough(options, sources, missing[unfinished], needed)
+        good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
+        missing[unfinished] -= good.sum(1)
+        before = sum(len(each.wording) for each in proposed)
+        owner, place = good.nonzero(as_tuple=True)
+        rows.append(before + owner * good.shape[1] + place)
+        proposed.append(proposal)
+        owners.append(unfinished[owner])
+        if not missing.any():
+            order = torch.cat(owners).argsort(stable=True)
+            return _said(_chosen(proposed, torch.cat(rows)[order]), options.task)
+        if len(proposed) == ROUNDS_HELD:
+            proposed = [_chosen(proposed, torch.cat(rows))]
+            rows = [torch.arange(len(proposed[0].wording))]
+        share = float(good.float().mean())
+        needed = min(CHUNK, int(1.15 * int(missing.max()) / max(share, 1e-3)) + 16)
+    raise UserError(
+        f"after {PATIENCE * CHUNK} draws only {CHUNK - int(missing.max())} scenes admit a "
+        f"suitable goal of {options.task!r} in split {options.split!r} within "
+        f"{options.max_steps} steps: give the layout more objects or boxes, or episodes more "
+        "steps"
+    )
+
+
+def _propose_enough(
+    options: SceneOptions, draws: list[torch.Generator], missing: Tensor, needed: int
+) -> tuple[_Proposal, Tensor]:
+    """Draw a chunk of scenes with each generator, and look at no more of them than it takes.
 
     Args:
         options: which scenes.
-        seed: of what is drawn.
-        device: where scenes go; they are drawn on the CPU.
-        kept: how many blocks of scenes are remembered, the last that were asked for.
+        draws: generators, G of them.
+        missing: how many scenes each still has to find, int64 [G].
+        needed: how many of a chunk should do; all are looked at if they do not.
 
-    >>> stream = SceneStream(SceneOptions("pick"), seed=0)
-    >>> scenes = stream.scenes(torch.tensor([5, 2000]))
-    >>> scenes.instruction.shape, scenes.wanted.verdict.tolist()
-    (torch.Size([2, 16]), [0, 0])
+    Returns:
+        As many scenes of each generator as were looked at, [G * K], and which of them have a
+        suitable goal, bool [G, K].
     """
+    before = [draw.get_state() for draw in draws]
+    scenes, good = _propose(options, Shares(draws, CHUNK, needed))
+    if needed == CHUNK or (good.sum(1) >= missing).all():
+        return scenes, good
+    for draw, state in zip(draws, before, strict=True):
+        draw.set_state(state)
+    return _propose(options, Shares(draws, CHUNK, CHUNK))
 
-    def __init__(
-        self,
-        options: SceneOptions,
-        seed: int,
-        device: torch.device | str | None = None,
-        *,
-        kept: int = BLOCKS_KEPT,
-    ) -> None:
-        self.options, self.seed = options, seed
-        self.device, self.kept = torch.device(device or "cpu"), kept
-        self._remember()
 
-    def _remember(self) -> None:
-        self._block = functools.lru_cache(maxsize=self.kept)(self._draw)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs: scenes are drawn again."""
-        return {name: value for name, value in vars(self).items() if name != "_block"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Become what was copied."""
-        vars(self).update(state)
-        self._remember()
-
-    def scenes(self, numbers: Tensor) -> Scene:
-        """Return the scenes with the given numbers, int64 [N]."""
-        blocks, rows = self._find(numbers)
-        drawn = [self._block(block)[0] for block in blocks]
-        return (drawn[0] if len(drawn) == 1 else _cat(drawn))[rows]
-
-    def write(self, numbers: Tensor, leaves: list[Tensor], rows: Tensor) -> None:
-        """Write the scenes with the given numbers, int64 [N], to rows of others, int64 [N].
-
-        That is ``others[rows] = self.scenes(numbers)``, in a third of the time.
-
-        Args:
-            numbers: which scenes.
-            leaves: what the others are made of, in the order of :func:`scene_leaves`.
-            rows: where, each once.
-        """
-        blocks, found = self._find(numbers)
-        drawn = [self._block(block)[1] for block in blocks]
-        for leaf, *parts in zip(leaves, *drawn, strict=True):
-            source = parts[0] if len(parts) == 1 else torch.cat(parts)
-            leaf.index_copy_(0, rows, source.index_select(0, found))
-
-    def _find(self, numbers: Tensor) -> tuple[list[int], Tensor]:
-        """Return the blocks that hold given scenes, and the scenes' rows in all of these."""
-        if not numbers.numel():
-            return [0], numbers
-        low, high = (int(end) for end in numbers.aminmax())
-        if low < 0:
-            raise UserError("scene numbers start at 0")
-        if (first := low // BLOCK) == high // BLOCK:
-            return [first], numbers - first * BLOCK
-        blocks, place = (numbers // BLOCK).unique(return_inverse=True)
-        return blocks.tolist(), place * BLOCK + numbers % BLOCK
-
-    def _draw(self, block: int) -> tuple[Scene, list[Tensor]]:
-        """Return the scenes of a block, and what they are made of."""
-        scenes = self._draw_block(block)
-        return scenes, scene_leaves(scenes)
-
-    def _draw_block(self, block: int) -> Scene:
-        """Draw the scenes of several chunks on the CPU, so that every device gets the same ones."""
-        options = self.options
-        numbers = range(block * AHEAD, (block + 1) * AHEAD)
-        draws = [generator(self.seed, "scenes", options.stream, number) for number in numbers]
-        missing = torch.full((AHEAD,), CHUNK)
-        needed = CHUNK
-        proposed: list[_Proposal] = []
-        rows: list[Tensor] = []
-        owners: list[Tensor] = []
-        for _ in range(PATIENCE):
-            unfinished = missing.nonzero().squeeze(-1)
-            sources = [draws[chunk] for chunk in unfinished]
-            proposal, good = self._propose_enough(sources, missing[unfinished], needed)
-            good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
-            missing[unfinished] -= good.sum(1)
-            before = sum(len(each.wording) for each in proposed)
-            owner, place = good.nonzero(as_tuple=True)
-            rows.append(before + owner * good.shape[1] + place)
-            proposed.append(proposal)
-            owners.append(unfinished[owner])
-            if not missing.any():
-                order = torch.cat(owners).argsort(stable=True)
-                scenes = _said(_chosen(proposed, torch.cat(rows)[order]), options.task)
-                return scenes.to(self.device)
-            if len(proposed) == ROUNDS_HELD:
-                proposed = [_chosen(proposed, torch.cat(rows))]
-                rows = [torch.arange(len(proposed[0].wording))]
-            share = float(good.float().mean())
-            needed = min(CHUNK, int(1.15 * int(missing.max()) / max(share, 1e-3)) + 16)
-        raise UserError(
-            f"after {PATIENCE * CHUNK} draws only {CHUNK - int(missing.max())} scenes admit a "
-            f"suitable goal of {options.task!r} in split {options.split!r} within "
-            f"{options.max_steps} steps: give the layout more objects or boxes, or episodes more "
-            "steps"
-        )
-
-    def _propose_enough(
-        self, draws: list[torch.Generator], missing: Tensor, needed: int
-    ) -> tuple[_Proposal, Tensor]:
-        """Draw a chunk of scenes with each generator, and look at no more of them than it takes.
-
-        Args:
-            draws: generators, G of them.
-            missing: how many scenes each still has to find, int64 [G].
-            needed: how many of a chunk should do; all are looked at if they do not.
-
-        Returns:
-            As many scenes of each generator as were looked at, [G * K], and which of them have a
-            suitable goal, bool [G, K].
-        """
-        before = [draw.get_state() for draw in draws]
-        scenes, good = self._propose(Shares(draws, CHUNK, needed))
-        if needed == CHUNK or (good.sum(1) >= missing).all():
-            return scenes, good
-        for draw, state in zip(draws, before, strict=True):
-            draw.set_state(state)
-        return self._propose(Shares(draws, CHUNK, CHUNK))
-
-    def _propose(self, draws: Shares) -> tuple[_Proposal, Tensor]:
-        """Draw scenes with each generator, and say which are suitable."""
-        options, n = self.options, len(draws)
-        state = random_layout(n, options.shown_layout, generator=draws)
-        goal = propose_goal(state, check_task(options.task), draws)
-        wanted = plan(state, goal, options.max_steps)
-        if options.split != "all":
-            listed = in_split(goal, options.split, options.holdout)
-            wanted.verdict = torch.where(listed, wanted.verdict, -1)
-        wording = _integers(len(grammar(options.task).phrasings), n, draws)
-        good = wanted.verdict == SUITABLE
-        if not options.instructed:
-            good = torch.ones_like(good)
-        return _Proposal(state, wanted, goal, wording), good.view(len(draws.generators), -1)
+def _propose(options: SceneOptions, draws: Shares) -> tuple[_Proposal, Tensor]:
+    """Draw scenes with each generator, and say which are suitable."""
+    n = len(draws)
+    state = random_layout(n, options.shown_layout, generator=draws)
+    goal = propose_goal(state, check_task(options.task), draws)
+    wanted = plan(state, goal, options.max_steps)
+    if options.split != "all":
+        listed = in_split(goal, options.split, options.holdout)
+        wanted.verdict = torch.where(listed, wanted.verdict, -1)
+    wording = _integers(len(grammar(options.task).phrasings), n, draws)
+    good = wanted.verdict == SUITABLE
+    if not options.instructed:
+        good = torch.ones_like(good)
+    return _Proposal(state, wanted, goal, wording), good.view(len(draws.generators), -1)
 
 
 class _Proposal(NamedTuple):
@@ -292,10 +212,6 @@ def plan_leaves(wanted: Plan) -> list[Tensor]:
 def scene_leaves(scenes: Scene) -> list[Tensor]:
     """Return what scenes are made of, always in the same order."""
     return [*state_leaves(scenes.state), *plan_leaves(scenes.wanted), scenes.instruction]
-
-
-def _cat(scenes: list[Scene]) -> Scene:
-    return torch.cat(scenes)  # type: ignore[arg-type, return-value]
 
 
 def propose_goal(state: WorldState, task: int, source: Generators) -> Goal:
