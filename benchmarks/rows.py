@@ -184,8 +184,7 @@ def gymnasium_vector() -> Row:
     )
 
 
-def collector(preset: str, batch: int) -> Row:
-    steps = 10 if preset == "paper" else 20480 // batch
+def collector(preset: str, batch: int, steps: int) -> Row:
     env = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
     policy = networks.make_policy(env, preset, seed=0, device=DEVICE)
     source = Collector(
@@ -463,9 +462,9 @@ ROWS: dict[str, Callable[[], Row]] = {
     "pixels": world_pixels,
     "rollout": env_rollout,
     "gymnasium": gymnasium_vector,
-    "collector-strong": functools.partial(collector, "strong", 1024),
-    "collector-strong-2048": functools.partial(collector, "strong", 2048),
-    "collector-paper": functools.partial(collector, "paper", 512),
+    "collector-strong": functools.partial(collector, "strong", 1024, 20),
+    "collector-strong-2048": functools.partial(collector, "strong", 2048, 10),
+    "collector-paper": functools.partial(collector, "paper", 512, 10),
     "sampler": sampler,
     **{f"imitation-{preset}": functools.partial(imitation, preset) for preset in PRESETS},
     "labelling": labelling,

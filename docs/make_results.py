@@ -22,7 +22,13 @@ from ifo_grounding.report import (
     save_figure,
 )
 from ifo_grounding.report.paper import EPISODES, TABLE_2
-from ifo_grounding.report.results import brief, commands_note, read_results, restored
+from ifo_grounding.report.results import (
+    brief,
+    commands_note,
+    effective,
+    read_results,
+    restored,
+)
 from ifo_grounding.report.results import unpacked as outcomes
 from ifo_grounding.report.tables import renewed
 from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap, wilson
@@ -35,7 +41,8 @@ EFFICIENCY = PICTURE.with_name("efficiency.png")
 FEW = 2000
 """Demonstrations up to which the README shows a study: with more there is little left to gain."""
 LONGER = "strong, 60-iterations"
-"""The preset that practises for longer, as a study of its own."""
+STRONG = ("strong", LONGER)
+"""The preset, and the same that practises for longer, as studies of their own."""
 HACKED = ROOT / "results" / "study" / "move-200-film-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
@@ -366,13 +373,6 @@ def differing(runs: list[dict[str, Any]]) -> dict[str, list[Any]]:
     }
 
 
-def effective(section: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a section that have an effect."""
-    single = section.get("trials", 1) == 1
-    alone = ("trials", "trial_steps") if single else ()
-    return {name: value for name, value in section.items() if name not in alone}
-
-
 def differing_note() -> str:
     """Say in which options the seeds of a study differ."""
     told = []
@@ -413,7 +413,7 @@ def efficient() -> dict[str, dict[int, dict[str, Rate]]]:
         found.setdefault(task, {})[n] = rates  # of what practises for longer, where both are there
 
     for (task, n, kind, held_out), runs in practised().items():
-        if kind in ("strong", LONGER) and not held_out:
+        if kind in STRONG and not held_out:
             add(task, n, runs)
     found = {task: by for task, by in found.items() if len(by) > 1}
     tabled = read_results(
@@ -514,7 +514,7 @@ def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
     aside = ("preset", "scenes", *JUDGED)
     found = zip(practised(), study_rows(), strict=True)
-    few = [row for (_, n, kind, _), row in found if n <= FEW and kind in ("strong", LONGER)]
+    few = [row for (_, n, kind, _), row in found if n <= FEW and kind in STRONG]
     rows = [shown(row, *aside) for row in few]
     note = "\n† made with [different options](docs/results.md#studies), by seed.\n"
     mixed = note if any("†" in str(row["seeds"]) for row in rows) else ""

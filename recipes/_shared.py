@@ -19,7 +19,7 @@ from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
 from ifo_grounding.errors import UserError
 from ifo_grounding.objectives import SupervisedLoss
-from ifo_grounding.report import text_table
+from ifo_grounding.report import format_cell, text_table
 from ifo_grounding.seeding import derive
 from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
 from ifo_grounding.training.run import Run, Stage
@@ -40,8 +40,6 @@ REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
 RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
 """Options that decide no result."""
-
-
 AT_LEAST_ONE = (
     "threads",
     "imitate.trials",
@@ -252,9 +250,9 @@ def tell(result: dict[str, Any]) -> None:
 def _written(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(_written, value))
-    if not isinstance(value, float):
-        return f"{value:,}" if isinstance(value, int) else str(value)
-    return f"{value:,.0f}" if value.is_integer() or abs(value) >= 1000 else f"{value:.4g}"
+    if isinstance(value, float) and not value.is_integer() and abs(value) < 1000:
+        return f"{value:.4g}"
+    return format_cell(round(value) if isinstance(value, float) else value)
 
 
 def plain(node: Any) -> Any:

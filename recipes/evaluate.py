@@ -36,7 +36,8 @@ from ifo_grounding.report.results import packed
 from ifo_grounding.training import Run
 from ifo_grounding.transforms import LearnedReward
 
-NAMES = dict(zip(("phase1", "phase2", "continued", "cloned"), (*POLICIES, *CONTROLS), strict=True))
+PHASES = ("phase1", "phase2")
+NAMES = dict(zip((*PHASES, "continued", "cloned"), (*POLICIES, *CONTROLS), strict=True))
 """Policies that a run may have, by their names in the results."""
 STAGES = dict(
     zip(NAMES, ("imitate", "self_examine", "continue_imitation", "clone_accepted"), strict=True)
@@ -82,7 +83,7 @@ def evaluate_policies(policies: dict[str, Any], run: Run, world: World) -> dict[
     """Measure success of each policy on the same fixed scenes, and the gain of phase 2."""
     measured = measured_success(policies, world)
     results = success_results(measured)
-    phases = [measured[name].outcomes for name in ("phase1", "phase2") if name in measured]
+    phases = [measured[name].outcomes for name in PHASES if name in measured]
     torch.save(torch.stack(phases), run / "outcomes.pt")
     if "phase2" in measured:
         results["gain"] = compare_success(measured["phase1"], measured["phase2"]).as_dict()
@@ -113,7 +114,7 @@ def evaluate_endings(policies: dict[str, Any], world: Grid) -> dict[str, Any]:
     Of a zero-shot evaluation, the same of instructions that name trained pairs alone.
     """
     shown = evaluation_scenes(world.options)
-    phases = {name: policies[name] for name in ("phase1", "phase2") if name in policies}
+    phases = {name: policies[name] for name in PHASES if name in policies}
 
     def endings(**scenes: Any) -> dict[str, Endings]:
         task, options = world.played(world.options.evaluate.episodes, **scenes)

@@ -8,14 +8,13 @@ from _options import as_made
 from _shared import (
     CLASSIFIER,
     GOAL,
-    POLICIES,
     REWARD,
     load_demonstrations,
     load_network,
     open_run,
 )
 from _worlds import World, open_world
-from evaluate import evaluate, evaluation_scenes
+from evaluate import NAMES, PHASES, evaluate, evaluation_scenes
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModule
 
@@ -95,8 +94,8 @@ def episode_pictures(run: Run, world: World, results: dict[str, Any]) -> dict[st
     found: dict[str, Any] = {}
     policies = [
         load_network(run, file, "imitate", world.options)
-        for phase, file in enumerate(POLICIES, 1)
-        if f"phase{phase}" in results
+        for name, file in NAMES.items()
+        if name in PHASES and name in results
     ]
     where = evaluation_scenes(world.options)
     drawn: dict[str, Any] = {"actions": world.actions}

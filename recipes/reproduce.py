@@ -24,6 +24,7 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import babyai
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json
+from ifo_grounding.report.results import effective
 from ifo_grounding.tasks import TASKS
 
 GOAL = "goal-pairs-5000"
@@ -70,9 +71,9 @@ class Piece:
             if begun
             else initialize_config_dir(version_base=None, config_dir=conf)
         ):
-            today = flat(compose("study", overrides=list(self.arguments)))
-        then = flat(read_json(self.file)["options"])
-        return list(differences(then, today))
+            today = plain(compose("study", overrides=list(self.arguments)))
+        then = read_json(self.file)["options"]
+        return list(differences(in_effect(then), in_effect(today)))
 
     def make(self) -> int:
         """Make it in a process of its own, at one thread; what it prints goes to a file."""
@@ -237,10 +238,19 @@ def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any
     return found
 
 
+def in_effect(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of a run that have an effect, by their full names."""
+    return flat(
+        {
+            part: effective(section) if isinstance(section, dict) else section
+            for part, section in options.items()
+        }
+    )
+
+
 def differences(then: dict[str, Any], today: dict[str, Any]) -> Iterator[str]:
     """Say which options are others today; one that was not there did nothing."""
-    single = {name for name, value in today.items() if name.endswith(".trials") and value == 1}
-    idle = {*RUNNING, *single, *(name.replace("trials", "trial_steps") for name in single)}
+    idle = {*RUNNING}
     if not today.get("controls.run"):
         idle |= {name for name in today if name.startswith("controls.")}
     for name in sorted((then.keys() | today.keys()) - idle):

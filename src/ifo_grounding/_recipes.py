@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import functools
 import inspect
 import io
@@ -15,7 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.types import Override
@@ -185,9 +184,7 @@ def _check_group(name: str, override: Override) -> None:
         compose(name, overrides=[override.input_line or ""])
     except HydraException:
         group, names = override.key_or_group, list(map(str, compose(name)))
-        close = difflib.get_close_matches(group, names, n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
-        listed = ", ".join(names)
+        hint, listed = did_you_mean(group, names), ", ".join(names)
         raise UserError(f"{name} has no option {group!r}{hint}: it has {listed}") from None
 
 
@@ -228,22 +225,21 @@ def _check_value(defaults: DictConfig, override: Override, choices: list[str]) -
 
 def _check_added(key: str) -> None:
     """Refuse to add to a section what no options and no part of the library have a name for."""
+    section, _, name = key.partition(".")
+    if not name or "." in name:
+        return
     from omegaconf import OmegaConf
 
     from ifo_grounding.networks import NetworkConfig
     from ifo_grounding.training import FitConfig, SelfExaminationConfig
 
-    section, _, name = key.partition(".")
-    if not name or "." in name:
-        return
     kinds = (NetworkConfig, FitConfig, SelfExaminationConfig)
     known = {each.name for kind in kinds for each in fields(kind)}
     for file in (recipes_folder() / "conf").rglob("*.yaml"):
         options = OmegaConf.select(OmegaConf.load(file), section)
         known |= set(map(str, options)) if OmegaConf.is_dict(options) else set()
     if name not in known:
-        close = difflib.get_close_matches(name, sorted(known), n=1)
-        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        hint = did_you_mean(name, sorted(known))
         raise UserError(f"unknown option {key!r}{hint}: nothing would read it")
 
 
@@ -264,8 +260,7 @@ def _locate(defaults: DictConfig, key: str, choices: list[str]) -> tuple[DictCon
         names = list(map(str, section.keys()))
         if part not in names:
             names = names if place else [*choices, *names]
-            close = difflib.get_close_matches(part, names, n=1)
-            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            hint = did_you_mean(part, names)
             where = f"{'.'.join(path[:place])!r} has" if place else "there are"
             raise UserError(f"unknown option {key!r}{hint}: {where} {', '.join(names)}")
         if place < len(path):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import runpy
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
 from ifo_grounding._recipes import one_line_errors, recipe_main, recipe_names, recipes_folder
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, did_you_mean
 
 __all__ = ["COMMANDS", "main", "recipe_main"]
 
@@ -83,6 +82,5 @@ def run_recipe(name: str, options: Sequence[str]) -> None:
 
 
 def _unknown(what: str, given: str, allowed: Sequence[str]) -> str:
-    close = difflib.get_close_matches(given, allowed, n=1)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    hint = did_you_mean(given, allowed)
     return f"unknown {what} {given!r}{hint}: choose one of {', '.join(allowed)}"

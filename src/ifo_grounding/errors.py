@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 from collections.abc import Iterable, Iterator
 
 
@@ -21,6 +22,16 @@ def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     if value not in options:
         listed = ", ".join(repr(option) for option in options)
         raise UserError(f"unknown {name} {value!r}: choose one of {listed}")
+
+
+def did_you_mean(given: str, allowed: Iterable[str]) -> str:
+    """Return a hint at the name that is most like the one given, empty where none is.
+
+    >>> did_you_mean("imitat", ["label", "imitate"])
+    " (did you mean 'imitate'?)"
+    """
+    close = difflib.get_close_matches(given, list(allowed), n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 @contextlib.contextmanager

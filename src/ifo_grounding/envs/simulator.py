@@ -66,7 +66,9 @@ class Simulator:
 
     def to(self, device: torch.device | str) -> Simulator:
         """Move the running episodes and all that follow to a device."""
-        self.device = torch.device(device)
+        if (device := torch.device(device)) == self.device:
+            return self
+        self.device = device
         self.steps, self.numbers = self.steps.to(self.device), self.numbers.to(self.device)
         if self._episodes is not None:
             state, wanted, tokens = self.state, self.wanted, self.instruction

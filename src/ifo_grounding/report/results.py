@@ -90,6 +90,16 @@ def brief(value: Measured) -> str:
     return str(value).rpartition(" (")[0].replace(" points", "")
 
 
+def effective(section: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a section that have an effect: one trial is none.
+
+    >>> effective({"steps": 300, "trials": 1, "trial_steps": 50})
+    {'steps': 300}
+    """
+    alone = ("trials", "trial_steps") if section.get("trials", 1) == 1 else ()
+    return {name: value for name, value in section.items() if name not in alone}
+
+
 def packed(outcomes: Tensor) -> str:
     """Return the success of each scene, bool [N], as hexadecimal digits of four scenes each."""
     return np.packbits(outcomes.numpy()).tobytes().hex()
