@@ -197,7 +197,8 @@ def collector(preset: str, batch: int, steps: int) -> Row:
         return_same_td=DEVICE == "cpu",  # as in self-examination: a batch is used and let go of
     )
     batches = iter(source)
-    seen = next(batches).select(keys.PIXELS, keys.INSTRUCTION).clone().unbind(1)
+    observed = next(batches).select(keys.PIXELS, keys.INSTRUCTION)
+    seen = [each.clone() for each in observed.unbind(1)]  # as the policy gets them, each in a row
 
     def collect() -> float:
         next(batches)

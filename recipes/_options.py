@@ -54,7 +54,7 @@ def as_made(options: DictConfig) -> DictConfig:
         UserError: where the command names what contradicts how the run was made.
     """
     named = [name.lstrip("+~").split("=")[0] for name in HydraConfig.get().overrides.task]
-    path = Run(options.run) / "options.json"
+    path = Run(str(options.run)) / "options.json"
     return merged(options, read_json(path), named) if path.exists() else options
 
 

@@ -49,6 +49,18 @@ AT_LEAST_ONE = (
 )
 
 
+def fewer(number: int, than: int, value: Any, otherwise: Any) -> Any:
+    """Return a value where a number is below another; in options ``${fewer:number,than,...}``.
+
+    >>> fewer(200, 1000, 64, 256)
+    64
+    """
+    return value if number < than else otherwise
+
+
+OmegaConf.register_new_resolver("fewer", fewer, replace=True)
+
+
 def open_run(options: DictConfig) -> Run:
     """Return the run of these options, with torch's threads and memory set."""
     for name in AT_LEAST_ONE:
@@ -64,7 +76,7 @@ def open_run(options: DictConfig) -> Run:
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:
         torch.set_num_threads(options.threads)
-    return Run(options.run, options.logger)
+    return Run(str(options.run), options.logger)
 
 
 def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:

@@ -199,6 +199,7 @@ def _check_choices(override: Override, allowed: list[str]) -> None:
 
 def _check_value(defaults: DictConfig, override: Override, choices: list[str]) -> None:
     from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
 
     key = override.key_or_group
     if override.is_add() or override.is_force_add():
@@ -207,9 +208,12 @@ def _check_value(defaults: DictConfig, override: Override, choices: list[str]) -
     section, name = _locate(defaults, key, choices)
     if override.is_delete() or override.is_sweep_override():
         return
-    if OmegaConf.is_missing(section, name) or OmegaConf.is_interpolation(section, name):
-        return  # what is required or composed of other options has no kind of its own
-    default, given = section[name], override.value()
+    if OmegaConf.is_missing(section, name):
+        return  # what is required has no kind of its own
+    try:
+        default, given = section[name], override.value()
+    except OmegaConfBaseException:
+        return  # nor has what is composed of others that only a run knows
     kind = list if OmegaConf.is_list(default) else float if name in _NUMBERS else type(default)
     if OmegaConf.is_dict(default) and not isinstance(given, dict):
         listed = ", ".join(map(str, default))

@@ -344,7 +344,7 @@ def test_partial_resets_touch_only_their_rows():
 @pytest.mark.parametrize("foreign", [False, True])
 @pytest.mark.parametrize("instructed", [False, True])
 def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
-    """So many that only what changed is drawn; with an entry of others, as EnvBase resets it."""
+    """So many that only what changed is drawn; with entries of others, as EnvBase resets them."""
     env = PickAndPlaceEnv("pick", 256, seed=0, instructed=instructed)
     td = env.reset()
     for turn in range(8):
@@ -354,7 +354,8 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
         numbers, mask = env.scene_numbers.clone(), torch.rand(256) < 0.2
         given = running.clone().set("_reset", mask.unsqueeze(-1))
         if foreign:
-            given["count"] = torch.ones(256, 1)
+            given["logits"] = torch.full((256, 6), torch.inf)
+            given["collector", "number"] = torch.arange(1, 257)
         td = env.reset(given)
         assert torch.equal(td["pixels"], render(env.simulator.state))
         assert torch.equal(td["done"], running["done"] & ~mask.unsqueeze(-1))
@@ -362,7 +363,8 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
         assert torch.equal(env.scene_numbers != numbers, mask)
         assert "_reset" not in td
         if foreign:
-            assert torch.equal(td["count"].squeeze(-1) == 0, mask)
+            assert torch.equal(td["logits"] == 0, mask.unsqueeze(-1).expand(-1, 6))
+            assert torch.equal(td["collector", "number"], torch.arange(1, 257) * ~mask)
         if instructed:
             began = env.simulator.stream.scenes(env.scene_numbers)
             assert torch.equal(td["instruction"], began.instruction)

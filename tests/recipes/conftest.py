@@ -13,6 +13,7 @@ def recipes():
 @pytest.fixture
 def compose(recipes, tmp_path):
     """Return a function that composes a recipe's options for a tiny run in a temporary folder."""
+    import _shared  # noqa: F401  (what options are computed by)
     from hydra import compose, initialize_config_dir
 
     def composed(name="two_phase", *overrides):

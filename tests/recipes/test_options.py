@@ -53,6 +53,23 @@ def test_what_a_run_was_made_with_counts_but_for_what_is_named(compose):
     assert (older.references, older.evaluate.split) == (False, "all")
 
 
+def test_few_demonstrations_are_imitated_in_small_batches_unless_told(compose):
+    def imitate(*said):
+        options = compose("two_phase", *said).imitate
+        return options.batch_size, options.get("prior", 0)
+
+    assert imitate("demonstrations.n=999") == (64, 1000)
+    assert imitate("demonstrations.n=1000") == (256, 2000)
+    assert imitate("demonstrations.n=999", "imitate.batch_size=32") == (32, 1000)
+    assert imitate("demonstrations.n=999", "preset=paper") == (128, 0)
+
+
+def test_a_run_may_be_called_by_a_number(compose):
+    from _shared import open_run
+
+    assert open_run(compose("two_phase", "run=7")).folder.name == "7"
+
+
 def test_a_report_says_what_the_run_was_made_with(compose, tmp_path, capsys):
     from two_phase import train_phases
 

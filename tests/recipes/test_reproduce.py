@@ -55,7 +55,7 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     *_, listed, noted = capsys.readouterr().out.splitlines()
     assert listed == f"done    {second.file}"
     assert [each.split()[-3:] for each in noted.strip().split(", ")] == [
-        ["imitate.prior", "(now", "2000)"],
+        ["imitate.prior", "(now", "1000)"],
         ["instruction.candidates=17", "(now", "16)"],
         ["instruction.fresh_states", "(now", "4096)"],
     ]

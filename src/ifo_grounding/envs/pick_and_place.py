@@ -197,14 +197,17 @@ class PickAndPlaceEnv(EnvBase):
         if tensordict is None or mask is None or self.expose_state:
             return super()._reset_proc_data(tensordict, tensordict_reset)
         merged = {name: tensordict_reset[name] for name in self._shown}
-        if set(DONE) <= tensordict.keys() <= {"_reset", keys.ACTION, *self._shown, *DONE}:
-            goes_on = ~mask.reshape(self.num_envs)
-            merged |= {name: tensordict[name] & goes_on.unsqueeze(-1) for name in DONE}
-            if keys.ACTION in tensordict:
-                merged[keys.ACTION] = tensordict[keys.ACTION] * goes_on
-            return TensorDict(merged, batch_size=self.batch_size, device=self.device)
         rest = tensordict.exclude(*self._shown)
-        return super()._reset_proc_data(rest, tensordict_reset.exclude(*self._shown)).update(merged)
+        if not set(DONE) <= tensordict.keys():
+            rest = super()._reset_proc_data(rest, tensordict_reset.exclude(*self._shown))
+            return rest.update(merged)
+        begins = mask.reshape(self.num_envs)
+
+        def blank(value: Tensor) -> Tensor:
+            """Forget what an episode left that is over: done flags, actions, entries of others."""
+            return value.masked_fill(begins.view(-1, *[1] * (value.ndim - 1)), 0)
+
+        return rest.exclude("_reset").apply(blank).update(merged)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
