@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -49,7 +51,7 @@ name: ${task}-run
 limit: null
 sizes: [1, 2]
 nested:
-  rate: 0.5
+  rate: 0.5  # how fast
 """
 FULL_ERROR = "HYDRA_FULL_ERROR"
 
@@ -168,8 +170,33 @@ def test_help_of_a_recipe_lists_its_options(recipes, capsys):
     assert run("run", "greet", "--help") == 0
     printed = capsys.readouterr().out
     assert printed.startswith("greet: options are written name=value")
-    assert "preset: paper, strong" in printed
-    assert "rate: 0.5" in printed
+    assert "\n  preset: paper, strong\n" in printed
+    assert "\nname: move-run" in printed
+    assert "\nlimit: null" in printed
+    assert "\nsizes: [1, 2]" in printed
+    assert re.search(r"\nnested:\n  rate: 0.5 +# how fast\n", printed + "\n")
+    assert run("run", "greet", "task=pick", "--help") == 0
+    assert "\nname: pick-run" in capsys.readouterr().out
+    assert run("run", "greet", "tsk=pick", "--help") == 2
+
+
+@pytest.mark.parametrize("chosen", [[], ["preset=paper", "budget=full"], ["world=babyai"]])
+def test_help_says_what_every_option_means(capsys, chosen):
+    for name in _recipes.recipe_names():
+        said = [] if name == "reproduce" else chosen
+        assert run("run", name, *said, "--help") == 0
+        printed = capsys.readouterr().out
+        lines = printed.partition("mean:\n\n")[2].partition("\noptions_of:")[0].splitlines()
+        for line, after in itertools.pairwise([*lines, ""]):
+            assert len(line) <= 100 or "#" not in line
+            assert "#" in line + after or line.endswith(":"), f"{name}: {line} has no meaning"
+
+
+def test_help_ends_where_its_reader_does():
+    script = recipes_folder() / "imitate.py"
+    command = f"{sys.executable} {script} --help | head -1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    assert (done.stdout.count("\n"), done.stderr) == (1, "")
 
 
 def test_a_recipe_runs_as_a_script_too(recipes):

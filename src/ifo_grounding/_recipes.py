@@ -14,6 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ifo_grounding._help import help_text
 from ifo_grounding.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
+CLOSED = 141
 _TAKES = {bool: "true or false", int: "a whole number", float: "a number", list: "a list"}
 _NUMBERS = ("prior", "checkpoint_seconds")
 """Options that take any number, though their values so far are whole."""
@@ -63,6 +65,9 @@ def one_line_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
+    except BrokenPipeError:  # whoever reads what is printed, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(CLOSED) from None
 
 
 def recipe_main(function: Callable[[DictConfig], object]) -> Callable[[], None]:
@@ -101,14 +106,21 @@ def recipe_main(function: Callable[[DictConfig], object]) -> Callable[[], None]:
             import hydra
 
             conf = script.parent / "conf"
-            check_options(conf, script.stem, sys.argv[1:])
+            flags = check_options(conf, script.stem, sys.argv[1:])
+            if flags.help and not flags.multirun:
+                print(help_text(conf, script.stem, flags.overrides))
+                return
             hydra.main(version_base=None, config_path=str(conf), config_name=script.stem)(job)()
 
     return main
 
 
-def check_options(conf: Path, name: str, arguments: Sequence[str]) -> None:
-    """Raise :class:`UserError` for the first argument that the options do not offer."""
+def check_options(conf: Path, name: str, arguments: Sequence[str]) -> Namespace:
+    """Return arguments as Hydra reads them.
+
+    Raises:
+        UserError: for the first that the options do not offer.
+    """
     from hydra import initialize_config_dir
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -120,7 +132,7 @@ def check_options(conf: Path, name: str, arguments: Sequence[str]) -> None:
         listed = ", ".join(sorted(path.stem for path in conf.glob("[!_]*.yaml")))
         raise UserError(f"there are no options named {name!r} in {conf}: choose one of {listed}")
     if flags.config_dir is not None or flags.hydra_help:
-        return
+        return flags
     overrides = []
     for text in flags.overrides:
         try:
@@ -129,6 +141,7 @@ def check_options(conf: Path, name: str, arguments: Sequence[str]) -> None:
             raise UserError(f"cannot read {text!r}: options are written name=value") from None
     with initialize_config_dir(version_base=None, config_dir=str(conf), job_name=name):
         _check_overrides(name, overrides, several=flags.multirun)
+    return flags
 
 
 def _parse_flags(arguments: Sequence[str]) -> Namespace:
