@@ -5,6 +5,8 @@ of ``README.md`` and ``docs/babyai.md`` between two marks. A test checks that al
 """
 
 import functools
+import sys
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
@@ -12,6 +14,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from ifo_grounding._recipes import recipes_folder
 from ifo_grounding.files import atomic_write, read_json
 from ifo_grounding.report import (
     audit_figure,
@@ -25,16 +28,19 @@ from ifo_grounding.report.paper import EPISODES, TABLE_2
 from ifo_grounding.report.results import (
     brief,
     commands_note,
-    effective,
     read_results,
     restored,
 )
 from ifo_grounding.report.results import unpacked as outcomes
-from ifo_grounding.report.tables import renewed
+from ifo_grounding.report.tables import folded, renewed
 from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap, wilson
 from ifo_grounding.tasks import TASKS
 
+sys.path.append(str(recipes_folder()))
+from _changes import changes
+
 ROOT = Path(__file__).parents[1]
+EARLIER = "†"
 PICTURE = ROOT / "docs" / "assets" / "studies.png"
 LEARNED = PICTURE.with_name("babyai.png")
 EFFICIENCY = PICTURE.with_name("efficiency.png")
@@ -65,6 +71,9 @@ BABYAI_POLICIES = {
 }
 LEVELS = ("GoToObj", "GoToLocal", "PickupLoc")
 """Levels of BabyAI that the page speaks of, run or not, with 1,000 demonstrations at least."""
+
+NAMING = ("seed", "run", "base", "results", "variant")
+"""Arguments that decide nothing, so that those of all seeds are the same without."""
 
 Key = tuple[str, int, str, float]
 """Of a study: task, demonstrations, preset and variant, and the share held out."""
@@ -112,7 +121,7 @@ def study_section() -> list[str]:
         " [chosen once](phase2.md#what-practice-gains-with-few).",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table([shown(row, *JUDGED) for row in rows]),
-        differing_note(),
+        earlier_note(),
         "Of each seed the share of suitable instructions among those chosen, of states served, and"
         " of states that any instruction of the pool suits, by the oracle: the most that could be"
         " served.",
@@ -329,7 +338,7 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
         "task": task,
         "demonstrations": f"{n:,}",
         "preset": f"{kind}, {held_out:.0%} held out" if held_out else kind,
-        "seeds": f"{len(runs)}†" if differing(runs) else len(runs),
+        "seeds": f"{len(runs)}{EARLIER}" if not scenes and any(map(earlier, runs)) else len(runs),
         "scenes": f"{both[0].shape[1]:,}{stream}",
         "iterations": runs[0]["options"]["self_examine"]["iterations"],
         "phase 1": brief(two_level_bootstrap(both[0])),
@@ -354,36 +363,26 @@ def over_control(name: str, runs: list[dict[str, Any]]) -> str:
     return ahead if len(having) == len(runs) else f"{ahead} ({len(having)} of {len(runs)} seeds)"
 
 
-def differing(runs: list[dict[str, Any]]) -> dict[str, list[Any]]:
-    """Return the options that decide what is learned and are not those of all seeds, by seed.
-
-    Runs from before an option was there have none, which is the same as zero, or as one trial.
-    """
-    every = [
-        {
-            f"{part}.{name}": value
-            for part in DECISIVE
-            for name, value in effective(run["options"].get(part, {})).items()
-        }
-        for run in runs
+def earlier(run: Mapping[str, Any]) -> list[str]:
+    """Return which options that decide what is learned are others today."""
+    said = [text for text in run["command"].split()[3:] if text.partition("=")[0] not in NAMING]
+    return [
+        change
+        for change in changes(run, said)
+        if change.removeprefix("no ").partition(".")[0] in DECISIVE
     ]
-    values = {name: [each.get(name) or 0 for each in every] for name in set().union(*every)}
-    return {
-        name: found for name, found in sorted(values.items()) if found.count(found[0]) < len(found)
-    }
 
 
-def differing_note() -> str:
-    """Say in which options the seeds of a study differ."""
-    told = []
+def earlier_note() -> str:
+    """Say which studies were made with other options than presets and budgets have today."""
+    told: dict[tuple[str, ...], list[str]] = {}
     for (task, n, kind, _), runs in practised().items():
-        if found := differing(runs):
-            options = ", ".join(
-                f"`{name}` {', '.join(f'{value:,}' for value in values)}"
-                for name, values in found.items()
-            )
-            told.append(f"{task}, {n:,}, {kind}: {options}")
-    return f"† made with different options, by seed: {'; '.join(told)}." if told else ""
+        of_seeds = Counter(tuple(earlier(run)) for run in runs)
+        for said, count in of_seeds.items():
+            seeds = f" ({count} of {len(runs)} seeds)" if count < len(runs) else ""
+            told.setdefault(said, []).append(f"{task} {n:,} {kind}{seeds}")
+    lines = [f"- {', '.join(who)}: {', '.join(said)}" for said, who in told.items() if said]
+    return folded(f"{EARLIER}: made with other options than presets and budgets have today", lines)
 
 
 def adjusted(found: dict[Key, list[dict[str, Any]]]) -> list[str]:
@@ -516,9 +515,9 @@ def readme(text: str) -> str:
     found = zip(practised(), study_rows(), strict=True)
     few = [row for (_, n, kind, _), row in found if n <= FEW and kind in STRONG]
     rows = [shown(row, *aside) for row in few]
-    note = "\n† made with [different options](docs/results.md#studies), by seed.\n"
-    mixed = note if any("†" in str(row["seeds"]) for row in rows) else ""
-    text = renewed(text, "results", f"\n{markdown_table(rows)}\n{mixed}")
+    said = "made with other options than `strong` has today: [which](docs/results.md#studies)."
+    note = f"\n{EARLIER} {said}\n" if any(EARLIER in str(row["seeds"]) for row in rows) else ""
+    text = renewed(text, "results", f"\n{markdown_table(rows)}\n{note}")
     return renewed(text, "babyai", strong_levels())
 
 

@@ -1,6 +1,7 @@
 """Options as a whole: refused before a run begins, and those that a finished run was made with."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from _shared import RUNNING, fit_config, plain, self_examination_config
@@ -36,6 +37,11 @@ def check(options: DictConfig) -> None:
         UserError: on a value that its stage would refuse.
     """
     world = open_world(options)
+    if options.recorded:
+        if not Path(options.recorded).is_dir():
+            raise UserError(f"recorded={options.recorded} is no folder of demonstrations")
+        if options.references:
+            raise UserError("recorded demonstrations hold no actions: leave references=true out")
     if isinstance(world, Grid):  # others need the words of their demonstrations first
         world.simulator()
     for section in LEARNED:

@@ -3,10 +3,11 @@
 import functools
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
-from _shared import changed_networks, load_demonstrations, open_run, plain
+from _shared import changed_networks, load_demonstrations, open_run, plain, shows_progress
 from omegaconf import DictConfig
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -17,13 +18,15 @@ from ifo_grounding.data import (
     Truth,
     babyai,
     bot_outcomes,
+    load_pictures,
     record_babyai,
     record_demonstrations,
 )
 from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
+from ifo_grounding.data.pictures import LIST
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv, from_gymnasium
-from ifo_grounding.errors import check_choice
-from ifo_grounding.tasks import Vocabulary
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.tasks import VOCABULARY, Vocabulary
 from ifo_grounding.world import Layout
 
 ROOMS = 256
@@ -40,6 +43,7 @@ class Grid:
     actions = keys.ACTIONS
     stop = keys.STOP
     oracle = True
+    vocabulary: Vocabulary | None = VOCABULARY
 
     def __init__(self, options: DictConfig) -> None:
         self.options, self.task = options, options.task
@@ -87,6 +91,7 @@ class BabyAI:
     actions = BABYAI_ACTIONS
     stop = DONE
     oracle = False
+    vocabulary: Vocabulary | None = None  # that of the demonstrations
 
     def __init__(self, options: DictConfig) -> None:
         self.options, self.level = options, options.task
@@ -150,6 +155,32 @@ def open_world(options: DictConfig) -> World:
     """Return the world of these options."""
     check_choice("simulator", options.simulator, WORLDS)
     return WORLDS[options.simulator](options)
+
+
+def read_recorded(options: DictConfig) -> Demonstrations:
+    """Read demonstrations that were recorded elsewhere, the first ``demonstrations.n`` of them.
+
+    Raises:
+        UserError: where there are none, or they show another world than the simulator's.
+    """
+    folder, world = Path(options.recorded), open_world(options)
+    if (folder / LIST).exists():
+        demos = load_pictures(folder, vocabulary=world.vocabulary, progress=shows_progress(options))
+    else:
+        demos = Demonstrations.load(folder)
+    if world.vocabulary and demos.vocabulary != world.vocabulary:
+        raise UserError(
+            f"instructions in {folder} have another vocabulary than the world: record them with "
+            "vocabulary=ifo_grounding.tasks.VOCABULARY, or train with the Python functions"
+        )
+    if isinstance(world, Grid):  # others need the words of their demonstrations first
+        shown = tuple(world.simulator().observation_spec[keys.PIXELS].shape[1:])
+        if demos.image_shape != shown:
+            raise UserError(
+                f"frames in {folder} are {list(demos.image_shape)}, those of the simulator "
+                f"{list(shown)}: set world.tile_size and world.layout.size as they were recorded"
+            )
+    return demos[: options.demonstrations.n]
 
 
 def context_of(options: DictConfig, section: str) -> int:

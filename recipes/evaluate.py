@@ -63,7 +63,8 @@ def evaluate(options: DictConfig) -> dict:
             file=sys.stderr,
         )
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
-    results: dict[str, Any] = {"labels": run.record("label")["result"]["accuracy"]}
+    labels = run.record("label")["result"].get("accuracy")
+    results: dict[str, Any] = {"labels": labels} if labels else {}
     policies = {
         name: load_network(run, file, "imitate", options)
         for name, file in NAMES.items()

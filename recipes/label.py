@@ -1,5 +1,7 @@
 """Label the demonstrations with the inverse module (paper, 1st-phase)."""
 
+from typing import Any
+
 from _shared import (
     INVERSE,
     LABELS,
@@ -15,7 +17,7 @@ from omegaconf import DictConfig
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import Truth, label_demonstrations
 from ifo_grounding.evaluation import label_accuracy
-from ifo_grounding.report import results_table
+from ifo_grounding.report import results_table, text_table
 
 
 def label(options: DictConfig) -> dict:
@@ -27,15 +29,24 @@ def label(options: DictConfig) -> dict:
     inverse = load_network(stage.run, INVERSE, "train_inverse", options)
     _, report = label_demonstrations(demos, inverse, progress=shows_progress(options))
     report.save(stage.run / LABELS)
+    found: dict[str, Any] = {"confidence": report.summary()}
     # Only the evaluation reads the truth: nothing of it goes back into training.
-    truth = Truth.load(stage.run.need(TRUTH, "record_demonstrations"))
-    accuracy = label_accuracy(report.actions, truth, names=open_world(options).actions)
-    return stage.finish({"confidence": report.summary(), "accuracy": accuracy.as_dict()})
+    if not options.recorded:
+        truth = Truth.load(stage.run.need(TRUTH, "record_demonstrations"))
+        accuracy = label_accuracy(report.actions, truth, names=open_world(options).actions)
+        found["accuracy"] = accuracy.as_dict()
+    return stage.finish(found)
 
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(results_table({"labels": label(options)["accuracy"]}))
+    found = label(options)
+    if "accuracy" in found:
+        print(results_table({"labels": found["accuracy"]}))
+    else:
+        names = open_world(options).actions
+        rows = [{**row, "action": names[row["action"]]} for row in found["confidence"]]
+        print(text_table(rows, title="confidence of the labels"))
 
 
 if __name__ == "__main__":

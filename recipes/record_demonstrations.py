@@ -1,21 +1,29 @@
-"""Record demonstrations: frames and instructions, never actions."""
+"""Record demonstrations, or read what others recorded: frames and instructions, never actions."""
+
+import shutil
 
 from _shared import DEMONSTRATIONS, TRUTH, open_stage, shows_progress, tell
-from _worlds import open_world
+from _worlds import open_world, read_recorded
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
 
 
 def record(options: DictConfig) -> dict:
-    stage = open_stage(options, "record_demonstrations", ["demonstrations"], needs=[])
+    decisive = ["demonstrations", *(["recorded"] if options.recorded else [])]
+    stage = open_stage(options, "record_demonstrations", decisive, needs=[])
     if stage.result is not None:
         return stage.result
-    demos, truth = open_world(options).demonstrate(
-        options.demonstrations.n, seed=options.seed, progress=shows_progress(options)
-    )
-    demos.save(stage.run / DEMONSTRATIONS)
-    truth.save(stage.run / TRUTH)
+    if options.recorded:
+        demos = read_recorded(options)
+        demos.save(stage.run / DEMONSTRATIONS)
+        shutil.rmtree(stage.run / TRUTH, ignore_errors=True)  # of others, recorded before
+    else:
+        demos, truth = open_world(options).demonstrate(
+            options.demonstrations.n, seed=options.seed, progress=shows_progress(options)
+        )
+        demos.save(stage.run / DEMONSTRATIONS)
+        truth.save(stage.run / TRUTH)
     counts = {"demonstrations": len(demos), "transitions": demos.transitions}
     return stage.finish({**counts, "instructions": len(demos.pool())})
 

@@ -3,7 +3,6 @@
 python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 """
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -12,11 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
-from _shared import RUNNING, plain, result_file
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
+from _changes import changes, flat
+from _shared import plain, result_file
 from omegaconf import DictConfig
 from tqdm import tqdm
 
@@ -24,7 +21,6 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import babyai
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json
-from ifo_grounding.report.results import effective
 from ifo_grounding.tasks import TASKS
 
 GOAL = "goal-pairs-5000"
@@ -64,16 +60,7 @@ class Piece:
         They are not part of its command, and a file that was made before they changed still counts
         as done: its numbers are those of the options that it holds.
         """
-        conf = str(Path(__file__).with_name("conf"))
-        begun = GlobalHydra.instance().is_initialized()  # as by the recipe itself
-        with (
-            contextlib.nullcontext()
-            if begun
-            else initialize_config_dir(version_base=None, config_dir=conf)
-        ):
-            today = plain(compose("study", overrides=list(self.arguments)))
-        then = read_json(self.file)["options"]
-        return list(differences(in_effect(then), in_effect(today)))
+        return changes(read_json(self.file), self.arguments)
 
     def make(self) -> int:
         """Make it in a process of its own, at one thread; what it prints goes to a file."""
@@ -227,39 +214,6 @@ def chain(
         arguments = tuple(f"{name}={value}" for name, value in given.items())
         of = (task, options.demonstrations, preset, phase, seed)
         yield Piece(names[phase], arguments, result_file(options.results, *of), given.get("base"))
-
-
-def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any]:
-    """Return the options of a section and of those below it, by their full names."""
-    found: dict[str, Any] = {}
-    for name, value in plain(section).items():
-        full = above + name
-        found |= flat(value, f"{full}.") if isinstance(value, dict) else {full: value}
-    return found
-
-
-def in_effect(options: dict[str, Any]) -> dict[str, Any]:
-    """Return the options of a run that have an effect, by their full names."""
-    return flat(
-        {
-            part: effective(section) if isinstance(section, dict) else section
-            for part, section in options.items()
-        }
-    )
-
-
-def differences(then: dict[str, Any], today: dict[str, Any]) -> Iterator[str]:
-    """Say which options are others today; one that was not there did nothing."""
-    idle = {*RUNNING}
-    if not today.get("controls.run"):
-        idle |= {name for name in today if name.startswith("controls.")}
-    for name in sorted((then.keys() | today.keys()) - idle):
-        if name not in today:
-            yield f"{name}={then[name]} (now there is none)"
-        elif name not in then and today[name]:
-            yield f"no {name} (now {today[name]})"
-        elif name in then and then[name] != today[name]:
-            yield f"{name}={then[name]} (now {today[name]})"
 
 
 def to_make(chain: list[Piece]) -> list[Piece]:

@@ -3,6 +3,10 @@
 import importlib.util
 from pathlib import Path
 
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from ifo_grounding._recipes import recipes_folder
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.stats import wilson
 
@@ -58,16 +62,18 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
         results = {name: {"outcomes": bits, "rate": {"count": 8}} for name, bits in solved.items()}
         rates = {"rate": 0.9, "served": 0.5, "servable": 0.6}
         results["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
-        options = {"task": "pick", "demonstrations": {"n": 2000}, "network": "strong", "seed": seed}
-        options["imitate"] = {"held_out": 0.0, "prior": 2000 * seed}
-        options["instruction"] = {"trials": 1, "trial_steps": 400} if seed else {}  # the same
-        options["self_examine"] = {"iterations": 20}
+        given = ["task=pick", "budget=study", "demonstrations.n=2000", f"seed={seed}"]
+        with initialize_config_dir(version_base=None, config_dir=str(recipes_folder() / "conf")):
+            options = OmegaConf.to_container(compose("study", ["run=unnamed", *given]), resolve=True)
         if seed:
             del results["continued"]
+        else:  # as before there was a prior
+            del options["imitate"]["prior"]
+            options["instruction"]["threshold"] = 0.7
         run = {
             "options": options,
             "results": results,
-            "command": f"ifo-grounding run study seed={seed}",
+            "command": " ".join(["ifo-grounding run study", *given]),
             "provenance": {"commit": "abc"},
         }
         write_json(tmp_path / "results" / "study" / f"{seed}.json", run)
@@ -79,8 +85,8 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
         assert shown in table
     assert "(1 of 2 seeds)" in table
     assert (
-        "† made with different options, by seed: pick, 2,000, strong: `imitate.prior` 0, 2,000."
-        in table
+        "- pick 2,000 strong (1 of 2 seeds): no imitate.prior (now 2000), "
+        "instruction.threshold=0.7 (now 0.6)\n" in table
     )
 
 

@@ -1,0 +1,73 @@
+"""Demonstrations that were recorded elsewhere, through the recipes."""
+
+import pytest
+
+from ifo_grounding.data import Demonstrations, record_demonstrations, save_pictures
+from ifo_grounding.errors import UserError
+
+
+@pytest.fixture
+def demos():
+    return record_demonstrations("move", 40, seed=7)
+
+
+@pytest.mark.parametrize("pictures", [False, True])
+def test_both_phases_learn_from_recorded_demonstrations(compose, tmp_path, demos, pictures, capsys):
+    from label import label
+    from two_phase import two_phase
+
+    from report import report
+
+    (save_pictures if pictures else Demonstrations.save)(demos, tmp_path / "shown")
+    given = [f"recorded={tmp_path / 'shown'}", "demonstrations.n=30"]
+    options = compose("two_phase", *given)
+    results = two_phase(options)
+    learned = Demonstrations.load(tmp_path / "run" / "demonstrations")
+    assert len(learned) == 30
+    for number in range(30):
+        assert learned[number]["pixels"].equal(demos[number]["pixels"])
+    assert learned.tokens.equal(demos.tokens[:30])
+    assert not (tmp_path / "run" / "truth").exists()
+    assert "labels" not in results
+    assert results["phase2"]["rate"]["count"] == 50
+    assert report(options).exists()
+    capsys.readouterr()
+    two_phase(compose("two_phase", *given))
+    assert "running" not in capsys.readouterr().out
+    assert "accuracy" not in label(compose("label", *given))
+
+
+def test_what_was_recorded_before_goes_with_its_truth(compose, tmp_path, demos):
+    from record_demonstrations import record
+
+    record(compose("record_demonstrations"))
+    assert (tmp_path / "run" / "truth").exists()
+    demos.save(tmp_path / "shown")
+    found = record(compose("record_demonstrations", f"recorded={tmp_path / 'shown'}"))
+    assert found["demonstrations"] == 40
+    assert not (tmp_path / "run" / "truth").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "refused"),
+    [
+        (["world.tile_size=16"], r"are \[3, 48, 48\], those of the simulator \[3, 96, 96\]"),
+        (["references=true"], "recorded demonstrations hold no actions"),
+        (["recorded=nowhere"], "recorded=nowhere is no folder"),
+    ],
+)
+def test_recorded_demonstrations_have_to_fit(compose, tmp_path, demos, said, refused):
+    from two_phase import two_phase
+
+    demos.save(tmp_path / "shown")
+    with pytest.raises(UserError, match=refused):
+        two_phase(compose("two_phase", f"recorded={tmp_path / 'shown'}", *said))
+
+
+def test_recorded_words_have_to_be_the_worlds(compose, tmp_path, demos):
+    from record_demonstrations import record
+
+    other = Demonstrations.from_episodes([("one", demos[0]["pixels"].numpy(), "go to it")])
+    other.save(tmp_path / "shown")
+    with pytest.raises(UserError, match="another vocabulary than the world"):
+        record(compose("record_demonstrations", f"recorded={tmp_path / 'shown'}"))
