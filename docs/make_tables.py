@@ -232,7 +232,10 @@ def content() -> str:
         table(path_rows),
         commands_note(found.values()),
         "## Ablations",
-        "What one choice does where demonstrations are few, preset `strong`. Gains of phase 2 over"
+        "What one choice does where demonstrations are few: 200 of `move` and 500 of `pick-out`,"
+        " preset `strong` as it was before it imitated so few in [smaller"
+        " batches](phase1.md#few-demonstrations); on `move` its instruction module is an earlier"
+        " one, without fresh states. Gains of phase 2 over"
         " phase 1 and differences from the whole, both greedy, are paired by scene, in points. The"
         " paper's reward is paid for every action, and discounted here as the goal reward is: a"
         " policy then earns most that never stops"
@@ -245,7 +248,7 @@ def content() -> str:
 
 
 VARIANTS_OF_PHASES = {
-    "whole": "the preset",
+    "whole": "the preset, batches of 256",
     "true-actions": "true actions instead of labels: an upper bound",
     "unchanged-kept": "transitions that change nothing are kept",
     "steps-10000": "10,000 random steps instead of 60,000",
@@ -433,7 +436,11 @@ PROBES = {
 def parts_content() -> str:
     """Return the table of what each part of the preset does, one part left out at a time."""
     found: Pieces = read_results(PARTS, lambda o: o["variant"])
-    rows = [part_row(said, found[name]) for name, said in VARIANTS.items() if name in found]
+    rows = [
+        part_row(f"{said} (`{name}`)", found[name])
+        for name, said in VARIANTS.items()
+        if name in found
+    ]
     return "\n\n".join([table(rows), commands_note(found.values())])
 
 

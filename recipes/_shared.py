@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -80,10 +80,10 @@ def open_run(options: DictConfig) -> Run:
 
 
 def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:
-    """Return a stage that is decided by some sections of the options, the seed and the world."""
+    """Return a stage that is decided by options or sections of them, the seed and the world."""
     release_freed_memory()  # of the stage before
     common = ["task", "seed", "network", "world"]
-    decisive = {key: plain(options[key]) for key in [*common, *sections]}
+    decisive = {key: plain(OmegaConf.select(options, key)) for key in [*common, *sections]}
     if changed := changed_networks(options):
         decisive["networks"] = changed  # only then: runs without any go on as they were
     run = open_run(options)
@@ -154,12 +154,18 @@ def train(
     held_out: Validation | None = None,
     finish: Callable[[], Any] | None = None,
     checkpoint: Path | None = None,
+    tried: Sequence[Metrics] = (),
     **found: float,
 ) -> dict:
-    """Fit a network to a buffer, do what is left to do, save it, and finish with what was found."""
-    history = learn(
-        options, stage, loss, buffer, section, checkpoint, held_out=held_out, log=stage.log()
-    )
+    """Fit a network to a buffer, do what is left to do, save it, and finish with what was found.
+
+    What was ``tried`` before, up to the checkpoint, is logged first.
+    """
+    log = stage.log()
+    if log is not None:
+        for metrics in tried:
+            log(metrics, int(metrics["step"]))
+    history = learn(options, stage, loss, buffer, section, checkpoint, held_out=held_out, log=log)
     if finish is not None:
         finish()
     networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
@@ -211,6 +217,7 @@ class Beginning:
         self.options, self.stage, self.section = options, stage, section
         self.loss, self.seen, self.number = loss, seen, number
         self.validation = HeldOut(loss, held_out) if held_out is not None else None
+        self.tried: list[Metrics] = []
         self.checkpoint = stage.checkpoint.with_stem(f"{stage.checkpoint.stem}-{number}")
 
     def try_out(self) -> float:
@@ -218,7 +225,8 @@ class Beginning:
         section = self.options[self.section]
         history = self.learn(until=section.trial_steps)
         iteration = fit_config(section).iteration
-        return history[: math.ceil(section.trial_steps / iteration)][-1][self.loss.out_keys[0]]
+        self.tried = history[: math.ceil(section.trial_steps / iteration)]
+        return self.tried[-1][self.loss.out_keys[0]]
 
     def learn(self, until: int | None = None) -> list[Metrics]:
         """Learn on from the checkpoint, up to some step or to the end."""
@@ -232,6 +240,7 @@ class Beginning:
             held_out=self.validation,
             finish=finish,
             checkpoint=self.checkpoint,
+            tried=self.tried,
             beginning=float(self.number),
         )
 

@@ -105,9 +105,10 @@ def matched_steps(options: DictConfig) -> int:
     """
     section = options.self_examine
     collected = section.iterations * section.num_envs * section.steps
-    samples = collected * (2 * section.epochs + 1 / 3)
+    epochs = section.epochs if section.algorithm == "ppo" else 1
+    samples = collected * (2 * epochs + 1 / 3)
     if section.rehearsal:
-        samples += collected / section.minibatch * section.epochs * Rehearsal.batch_size
+        samples += collected / section.minibatch * epochs * Rehearsal.batch_size
     return round(samples / options.imitate.batch_size)
 
 

@@ -4,7 +4,7 @@ import sys
 from typing import Any
 
 import torch
-from _options import as_made
+from _options import OF_EVALUATION, as_made
 from _results import keep_result, write_result
 from _shared import (
     CLASSIFIER,
@@ -20,6 +20,7 @@ from _worlds import Grid, World, open_world
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import (
     Endings,
     SuccessResult,
@@ -50,7 +51,7 @@ HELD_OUT = 500
 def evaluate(options: DictConfig) -> dict:
     phases = ["label", "imitate", "train_instruction", "train_reward", "train_goal", "self_examine"]
     controls = ["continue_imitation", "clone_accepted"]
-    stage = open_stage(options, "evaluate", ["evaluate"], needs=[*phases, *controls])
+    stage = open_stage(options, "evaluate", list(OF_EVALUATION), needs=[*phases, *controls])
     if stage.result is not None:
         return stage.result
     run = stage.run
@@ -70,6 +71,8 @@ def evaluate(options: DictConfig) -> dict:
         for name, file in NAMES.items()
         if (run / file).exists() and run.is_current(STAGES[name])
     }
+    if PHASES[0] not in policies:
+        raise UserError("phase 1 is of labels that were made anew: run the recipe imitate again")
     world = open_world(options)
     results |= evaluate_policies(policies, run, world)
     if world.oracle:

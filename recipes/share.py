@@ -15,31 +15,34 @@ from _shared import (
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.networks import save_pretrained
 from ifo_grounding.report import results_rows
 from ifo_grounding.training import Run
 
 FILES = {
-    "policy": POLICIES,
-    "inverse": (INVERSE,),
-    "instruction": (CLASSIFIER,),
-    "reward": (REWARD,),
-    "goal": (GOAL,),
+    "policy": {"self_examine": POLICIES[1], "imitate": POLICIES[0]},
+    "inverse": {"train_inverse": INVERSE},
+    "instruction": {"train_instruction": CLASSIFIER},
+    "reward": {"train_reward": REWARD},
+    "goal": {"train_goal": GOAL},
 }
-"""Files of each network; the last one that a run has is the one to share."""
+"""Files of each network by the stage that makes them; the first that is current is shared."""
 
 
 def share(options: DictConfig) -> list[Path]:
     run = open_run(options)
     run.need(POLICIES[0], "imitate")
+    if not run.is_current("imitate"):
+        raise UserError("phase 1 is of labels that were made anew: run the recipe imitate again")
     demos = load_demonstrations(run)
     facts = card_facts(run)
     written = []
     for name, files in FILES.items():
-        present = [file for file in files if (run / file).exists()]
-        if present:
-            network = load_network(run, present[-1], "two_phase", options)
+        current = [file for made_by, file in files.items() if run.is_current(made_by)]
+        if current:
+            network = load_network(run, current[0], "two_phase", options)
             hub_id = f"{options.hub}-{name}" if options.hub else None
             folder = Path(options.to) / name
             written.append(
@@ -51,9 +54,12 @@ def share(options: DictConfig) -> list[Path]:
 
 
 def card_facts(run: Run) -> dict[str, object]:
-    """Return what a model card says of a run: task, data, results, and the command."""
+    """Return what a model card says of a run: task, data, results, and the command.
+
+    Nothing where the results are those of networks that were made anew since.
+    """
     path = run / "result.json"
-    if not path.exists():
+    if not path.exists() or not run.is_current("evaluate"):
         return {}
     found = read_json(path)
     options = found["options"]

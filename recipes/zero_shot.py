@@ -30,7 +30,7 @@ from train_inverse import train_inverse
 
 from ifo_grounding import keys
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.errors import check_choice
+from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.evaluation import episode_endings, probe
 from ifo_grounding.evaluation.endings import SUCCESS
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
@@ -132,13 +132,17 @@ def compare(options: DictConfig) -> dict[str, dict]:
     """Imitate the same demonstrations with each variant, and measure what it does and sees."""
     for name in options.variants:
         check_choice("variant", name, VARIANTS)
+    if options.network != "strong":
+        raise UserError(f"variants are of preset strong: leave preset={options.network} out")
     for prepare in (collect, train_inverse, record, label):
         prepare(options)
-    seen, _ = labelled_demonstrations(open_run(options), 0.0)
-    return {name: imitate_with(name, seen, options) for name in options.variants}
+    seen, held_out = labelled_demonstrations(open_run(options), options.imitate.held_out)
+    return {name: imitate_with(name, seen, held_out, options) for name in options.variants}
 
 
-def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
+def imitate_with(
+    name: str, seen: ReplayBuffer, held_out: ReplayBuffer | None, options: DictConfig
+) -> dict:
     """Imitate with one variant and keep what was measured."""
     if name in SENTENCES:
         options = options.copy()
@@ -146,7 +150,8 @@ def imitate_with(name: str, seen: ReplayBuffer, options: DictConfig) -> dict:
     stage = open_stage(options, f"zero-shot-{name}", ["imitate", "evaluate"], ["label"])
     results = stage.result
     if results is None:
-        best = best_beginning(options, stage, seen, None, functools.partial(beginning, name))
+        build = functools.partial(beginning, name)
+        best = best_beginning(options, stage, seen, held_out, build)
         best.learn()
         results = stage.finish(measured(best.loss.network, options))
     options.variant = name if options.world.holdout_visible else f"{name}-absent"
@@ -181,7 +186,9 @@ def measured(policy: nn.Module, options: DictConfig) -> dict[str, Any]:
         place, shown = world.played(section.episodes, **scenes)
         ends = episode_endings(policy, place, **shown)
         results[name] = {**ends.as_dict(), **by_scene(ends.kind == SUCCESS)}
-    asked = {"seed": section.seed, "stream": section.stream, "holdout": options.world.holdout}
+    asked = world.arguments(seed=section.seed, stream=section.stream)
+    for decided in ("split", "holdout_visible"):  # by what is probed
+        del asked[decided]
     results["probes"] = probe(policy, options.task, **asked).as_dict()
     return results
 

@@ -1,10 +1,21 @@
 """Files that are there as a whole or not at all."""
 
+import json
+import math
 import os
 
 import pytest
 
-from ifo_grounding.files import atomic_write
+from ifo_grounding.files import atomic_write, write_json
+
+
+def test_what_is_not_finite_becomes_null(tmp_path):
+    write_json(tmp_path / "file", {"b": [math.nan, 1.5], "a": (math.inf, True), "c": "nan"})
+    assert json.loads((tmp_path / "file").read_text()) == {
+        "a": [None, True],
+        "b": [None, 1.5],
+        "c": "nan",
+    }
 
 
 @pytest.mark.parametrize("moves", [0, 1])

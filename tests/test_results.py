@@ -64,7 +64,9 @@ def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
         results["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
         given = ["task=pick", "budget=study", "demonstrations.n=2000", f"seed={seed}"]
         with initialize_config_dir(version_base=None, config_dir=str(recipes_folder() / "conf")):
-            options = OmegaConf.to_container(compose("study", ["run=unnamed", *given]), resolve=True)
+            options = OmegaConf.to_container(
+                compose("study", ["run=unnamed", *given]), resolve=True
+            )
         if seed:
             del results["continued"]
         else:  # as before there was a prior

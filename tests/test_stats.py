@@ -222,6 +222,22 @@ def test_auc_interval_matches_its_spread_over_samples():
     assert width == pytest.approx(2 * 1.96 * spread, rel=0.15)
 
 
+@pytest.mark.parametrize(("positives", "shift"), [(1, 2), (2, 1), (20, 2), (40, 3)])
+def test_auc_intervals_cover_the_truth_where_one_kind_is_rare(positives, shift):
+    rng = np.random.default_rng(0)
+    truth = scipy_stats.norm.cdf(shift / math.sqrt(2))
+    draws = [auc(rng.normal(shift, 1, positives), rng.normal(0, 1, 300)) for _ in range(200)]
+    assert np.mean([draw.low <= truth <= draw.high for draw in draws]) > 0.92
+
+
+def test_auc_is_not_sure_of_what_one_success_shows():
+    alone = auc([9.0], np.arange(9))
+    assert alone.value == alone.high == 1.0 and 0.2 < alone.low < 0.8
+    many = auc(np.arange(500) + 500, np.arange(500))
+    assert 0.99 < many.low < 1.0
+    assert auc([1.0, 1.0], [1.0, 1.0]).low < 0.2
+
+
 def test_auc_of_groups_knows_that_copies_add_nothing():
     rng = np.random.default_rng(0)
     x, y = rng.normal(1, 1, 50), rng.normal(0, 1, 50)

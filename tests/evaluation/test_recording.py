@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, success_rate
 from ifo_grounding.tasks import grammar
 
@@ -41,6 +44,13 @@ def test_frames_for_people_are_larger(random_policy):
     large = record_episodes(random_policy, "move", [0], render_tile_size=32)[0]
     assert large.frames.shape[1:] == (3, 192, 192)
     assert large.sentence == small.sentence
+
+
+def test_scenes_of_a_world_without_numbers_are_the_first_ones(random_policy):
+    world = PickAndPlaceEnv("move", num_envs=2)
+    assert len(record_episodes(random_policy, world, range(2))) == 2
+    with pytest.raises(UserError, match="cannot be reset to a scene by its number"):
+        record_episodes(random_policy, world, [5, 9])
 
 
 def test_no_scenes_no_episodes(random_policy):

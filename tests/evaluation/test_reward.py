@@ -8,8 +8,10 @@ import math
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from torchrl.envs import SerialEnv
 
 from ifo_grounding.data import record_demonstrations
+from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import return_correlation, reward_audit
 from ifo_grounding.networks import make_goal_judge, make_policy, make_reward_model
@@ -134,6 +136,16 @@ def test_real_models_of_both_kinds(recorded):
         audit = return_correlation(policy, pay, "move", episodes=100)
         assert torch.isfinite(audit.returns).all() and (audit.returns >= 0).all()
         assert audit.success.count == 100
+
+
+def test_worlds_in_workers_are_judged(recorded):
+    demos, _ = recorded
+    policy, judge = make_policy(demos, "paper", seed=0), make_goal_judge(demos, "paper", seed=0)
+    worlds = SerialEnv(3, lambda: PickAndPlaceEnv("move", num_envs=2, seed=0))
+    audit = return_correlation(
+        policy, LearnedReward(judge, kind="goal", stop_action=5), worlds, episodes=8, max_steps=10
+    )
+    assert audit.success.count == 8 and torch.isfinite(audit.returns).all()
 
 
 def test_a_goal_judge_is_shown_the_first_and_the_last_frame(make_expert):

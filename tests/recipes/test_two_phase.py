@@ -88,7 +88,9 @@ def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
     frames = section.iterations * section.num_envs * section.steps
     rehearsed = frames / section.minibatch * section.epochs * 256
     samples = frames * (2 * section.epochs + 1 / 3) + rehearsed
-    assert matched_steps(options) == round(samples / 256)
+    assert matched_steps(options) == round(samples / options.imitate.batch_size)
+    once = compose("study", "self_examine.algorithm=reinforce", "self_examine.rehearsal=0")
+    assert matched_steps(once) == round(frames * (2 + 1 / 3) / once.imitate.batch_size)
     for control in ("continue_imitation", "clone_accepted"):
         history = json.loads((tmp_path / "run" / "metrics" / f"{control}.json").read_text())
         assert 0 <= history[-1]["selection_return"] <= 1
@@ -230,6 +232,53 @@ def test_a_report_leaves_out_what_is_not_there_or_of_another_phase_1(compose, tm
     assert "Episodes of phase 1" in page
     assert "Imitation" in page
     assert "Self-examination" not in page and "Chosen instructions" not in page
+
+
+def test_nothing_is_shared_or_measured_of_another_phase_1(compose, tmp_path):
+    from evaluate import evaluate
+    from imitate import imitate
+    from share import share
+    from train_inverse import train_inverse
+    from two_phase import two_phase
+
+    two_phase(compose("two_phase"))
+    imitate(compose("imitate", "imitate.steps=30"))
+    shared = {folder.name for folder in share(compose("share", f"to={tmp_path / 'shared'}"))}
+    assert shared == {"policy", "inverse"}
+    given = networks.from_pretrained(tmp_path / "shared" / "policy").state_dict()
+    trained = networks.load(tmp_path / "run" / "policy-phase1.safetensors").state_dict()
+    assert all(torch.equal(weight, trained[name]) for name, weight in given.items())
+    assert "success" not in (tmp_path / "shared" / "policy" / "README.md").read_text()
+    train_inverse(compose("train_inverse", "inverse.steps=30"))
+    for recipe in (share, evaluate):
+        with pytest.raises(UserError, match="run the recipe imitate again"):
+            recipe(compose("share", f"to={tmp_path / 'shared'}"))
+
+
+def test_instructions_chosen_by_other_options_are_evaluated_anew(compose):
+    from evaluate import evaluate
+    from two_phase import train_phases
+
+    train_phases(compose("two_phase", "practise=false"))
+    served = []
+    for threshold in (0.01, 0.9999):
+        options = compose("evaluate", f"instruction.threshold={threshold}")
+        served.append(evaluate(options)["suitability"]["served"]["rate"])
+    assert served[0] > served[1]
+
+
+def test_the_log_begins_with_the_trials(compose, tmp_path):
+    from imitate import imitate
+    from label import label
+    from record_demonstrations import record
+    from train_inverse import train_inverse
+    from collect_transitions import collect  # isort: skip
+
+    options = compose("imitate", "logger=csv")
+    for stage in (record, collect, train_inverse, label, imitate):
+        stage(options)
+    (file,) = (tmp_path / "run" / "logs" / "imitate").rglob("loss_imitation.csv")
+    assert [line.split(",")[0] for line in file.read_text().split()] == ["10", "20"]
 
 
 @pytest.mark.parametrize(

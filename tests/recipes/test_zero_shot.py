@@ -46,6 +46,10 @@ def test_variants_leave_a_file_each_and_are_made_once(options, tmp_path):
     assert set(absent["results"]["held-out"]["by_object"]) <= held_out
     with pytest.raises(UserError, match="unknown variant 'hole'"):
         compare(options("variants=[hole]"))
+    with pytest.raises(UserError, match="variants are of preset strong"):
+        compare(options("preset=paper"))
+    larger = ("run=three", "world.tile_size=16", "imitate.held_out=0.2")
+    assert compare(options("variants=[whole]", *larger))["whole"]["probes"]
 
 
 def test_each_variant_changes_what_it_says(options):

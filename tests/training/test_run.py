@@ -1,6 +1,7 @@
 import csv
 
 import pytest
+import torch
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.training import Checkpoint, Run
@@ -110,6 +111,17 @@ def test_a_stage_that_is_done_anew_logs_anew(tmp_path):
         stage = Run(tmp_path / "run").stage("train", settings)
         stage.log()({"loss": value}, 10)
         stage.finish({})
+    (file,) = (tmp_path / "run" / "logs" / "train").rglob("*.csv")
+    assert file.read_text().split() == ["10,0.25"]
+
+
+def test_a_checkpoint_of_other_settings_does_not_keep_their_log(tmp_path):
+    for settings, value in ((1, 0.5), (2, 0.25)):
+        stage = Run(tmp_path / "run").stage("train", settings)
+        for step in (10, 20)[: 3 - settings]:
+            stage.log()({"loss": value}, step)
+        stage.checkpoint.parent.mkdir(exist_ok=True)
+        torch.save({}, stage.checkpoint)  # and then it is killed
     (file,) = (tmp_path / "run" / "logs" / "train").rglob("*.csv")
     assert file.read_text().split() == ["10,0.25"]
 

@@ -1,9 +1,11 @@
+import copy
+
 import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding.training import select_pairs, self_examine
-from ifo_grounding.training.selection import BestPolicy, learned_returns
+from ifo_grounding.training.selection import BestPolicy, Selection, learned_returns
 from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
 from training.test_self_examination import (
     POOL,
@@ -93,6 +95,24 @@ def test_stored_pairs_are_looked_at_from_the_same_starts():
     frozen = config(iterations=3, value_warmup=3, select_every=1, select_episodes=16, max_steps=4)
     history = self_examine(env, policy, value, frozen, seed=0)
     assert len({metrics["selection_return"] for metrics in history}) == 1
+
+
+def test_the_first_look_is_at_the_first_stored_pairs(monkeypatch):
+    """As that of a control, which makes its selection before anything is played."""
+    remembered = []
+
+    class Seen(Selection):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
+            remembered.extend(self.first_starts)
+
+    monkeypatch.setattr("ifo_grounding.training.self_examination.Selection", Seen)
+    pairs = select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
+    starts = StartingPairs(pairs)
+    env = TransformedEnv(simulator(8), Compose(starts, LearnedReward(likes(1))))
+    first = copy.deepcopy(starts.state_dict())
+    self_examine(env, *make_networks(), config(iterations=1, select_every=1), seed=0)
+    assert all(torch.equal(value, first[name]) for name, value in remembered[0].items())
 
 
 def test_looking_leaves_the_training_as_it_is():

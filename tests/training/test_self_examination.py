@@ -241,10 +241,12 @@ def test_worlds_in_workers_are_practised_in(kind):
         worlds, Compose(InstructionSampler(accepts_all(), POOL), LearnedReward(likes(1)))
     )
     try:
-        history = self_examine(env, *make_networks(), config(iterations=2), seed=0)
+        looking = config(iterations=2, select_every=1, select_episodes=12)
+        history = self_examine(env, *make_networks(), looking, seed=0)
     finally:
         env.close(raise_if_closed=False)
     assert history[-1]["frames"] == 2 * 4 * 8
+    assert history[-1]["selection_return"] > 0
 
 
 def test_no_true_reward_reaches_the_learner():
@@ -275,6 +277,8 @@ def test_envs_that_leak_or_lack_something_are_refused():
     worlds = SerialEnv(2, lambda: simulator(4, expose_state=True))
     with pytest.raises(UserError, match="never sees the true state"):
         self_examine(worlds, policy, value, config(), seed=0)
+    with pytest.raises(UserError, match="never sees true instructions"):
+        self_examine(PickAndPlaceEnv("move", 4, seed=0), policy, value, config(), seed=0)
     with pytest.raises(UserError, match="no instructions"):
         self_examine(simulator(), policy, value, config(), seed=0)
     sampled = TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))

@@ -227,7 +227,9 @@ def return_correlation(
                 start,
                 mode=mode,
                 max_steps=max_steps,
-                on_step=_purse(pay.ask(env), start[keys.PIXELS].clone(), total, discount),
+                on_step=_purse(
+                    pay.ask(env), start.reshape(-1)[keys.PIXELS].clone(), total, discount
+                ),
             )
         if average:
             total = total / outcomes.lengths

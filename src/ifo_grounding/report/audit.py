@@ -88,4 +88,4 @@ def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
 def _known(history: Sequence[Mapping[str, float]], name: str) -> list[tuple[float, float]]:
     """Iterations at which a metric is known, and its values."""
     rows = [(row["step"], row[name]) for row in history if name in row]
-    return [(step, value) for step, value in rows if np.isfinite(value)]
+    return [(step, value) for step, value in rows if value is not None and np.isfinite(value)]

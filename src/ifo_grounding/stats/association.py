@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import optimize
 from scipy import stats as scipy_stats
 
 from ifo_grounding.errors import UserError
@@ -24,7 +25,9 @@ def auc(
     """Return the probability that a positive scores above a negative, ties counting half.
 
     The interval is DeLong's (1988); where groups are given (scores from one demonstration belong
-    together) Obuchowski's (1997) for clustered data.
+    together) Obuchowski's (1997) for clustered data. Both are too narrow near 0 and 1 and where one
+    kind has few scores, so that the interval also covers Newcombe's (2006, method 5) for as many
+    scores as there are groups, which inverts the variance of Hanley and McNeil.
 
     Args:
         positive: scores that should be high, [N].
@@ -52,9 +55,27 @@ def auc(
     gx = np.asarray(positive_groups if grouped else np.arange(len(x))).ravel()
     gy = np.asarray(negative_groups if grouped else len(x) + np.arange(len(y))).ravel()
     error = _clustered_error(wins - value, losses - value, gx, gy)
-    half = float(scipy_stats.norm.ppf(0.5 + confidence / 2)) * error
-    method = "area under the ROC curve, DeLong" + (" by groups" if grouped else "")
-    return Estimate(value, max(0.0, value - half), min(1.0, value + half), count, method)
+    z = float(scipy_stats.norm.ppf(0.5 + confidence / 2))
+    low, high = max(0.0, value - z * error), min(1.0, value + z * error)
+    method = "area under the ROC curve, DeLong and Newcombe" + (" by groups" if grouped else "")
+    sizes = len(np.unique(gx)), len(np.unique(gy))
+    low, high = min(low, _limit(value, 0.0, *sizes, z)), max(high, _limit(value, 1.0, *sizes, z))
+    return Estimate(value, low, high, count, method)
+
+
+def _limit(value: float, end: float, m: int, n: int, z: float) -> float:
+    """Return the area furthest from ``value`` towards an end that ``value`` does not refute."""
+
+    def excess(area: float) -> float:
+        """How much further away an area is than its own standard errors allow."""
+        few = (m + n) / 2 - 1
+        spread = 1 + few * (1 - area) / (2 - area) + few * area / (1 + area)
+        return abs(value - area) - z * math.sqrt(area * (1 - area) * spread / (m * n))
+
+    if value == end:
+        return end
+    beside = value + (end - value) * 1e-9  # at 0 and 1 there is no error, and another root
+    return float(optimize.brentq(excess, beside, end))
 
 
 def _clustered_error(

@@ -12,13 +12,16 @@ from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.supervised import Metrics
-from ifo_grounding.transforms._common import exposes_state, innermost
+from ifo_grounding.transforms._common import exposes_state, innermost, instructs
 
 
 def check_env(env: EnvBase) -> None:
-    """Refuse an env that shows the true state or pays no learned reward."""
-    if exposes_state(innermost(env)):
+    """Refuse an env that shows the true state or instructions, or pays no learned reward."""
+    simulator = innermost(env)
+    if exposes_state(simulator):
         raise UserError("self-examination never sees the true state: use expose_state=False")
+    if instructs(simulator):
+        raise UserError("self-examination never sees true instructions: use instructed=False")
     observed = env.observation_spec.keys(True, True)
     if keys.INSTRUCTION not in observed:
         raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")

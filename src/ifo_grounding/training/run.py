@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.files import home, read_json, write_json
+from ifo_grounding.files import atomic_write, home, read_json, write_json
 from ifo_grounding.training.checkpoint import fingerprint, spent
 from ifo_grounding.training.supervised import Log, Metrics
 
@@ -173,9 +173,15 @@ class Stage:
         from torchrl.record.loggers import get_logger
 
         folder = self.run.folder / "logs"
-        if not self._continues and self.run.logger != "wandb":
-            shutil.rmtree(folder / self.name, ignore_errors=True)  # of other settings
-        logged = _last_step(folder / self.name) if self._continues else -1
+        goes_on = self._continues
+        if self.run.logger != "wandb":
+            made_of = folder / self.name / "settings"
+            goes_on &= made_of.exists() and made_of.read_text() == self.settings
+            if not goes_on:
+                shutil.rmtree(folder / self.name, ignore_errors=True)  # of other settings
+            with atomic_write(made_of) as temporary:
+                temporary.write_text(self.settings)
+        logged = _last_step(folder / self.name) if goes_on else -1
         options = (
             {"wandb_kwargs": {"project": "ifo-grounding"}} if self.run.logger == "wandb" else {}
         )

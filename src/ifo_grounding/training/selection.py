@@ -52,8 +52,8 @@ def _batch_returns(env: EnvBase, policy: nn.Module, max_steps: int) -> Tensor:
     for _ in range(max_steps):
         action = torch.zeros(rows, dtype=torch.int64, device=state[keys.PIXELS].device)
         running = alive.to(action.device)
-        action[running] = policy(state[running])[keys.ACTION]
-        stepped = env.step(state.set(keys.ACTION, action))
+        action[running] = policy(state.reshape(rows)[running])[keys.ACTION]
+        stepped = env.step(state.set(keys.ACTION, action.reshape(state.batch_size)))
         after = stepped[keys.NEXT]
         total += after[keys.LEARNED_REWARD].reshape(-1).cpu() * alive
         alive &= ~after["done"].reshape(-1).cpu()

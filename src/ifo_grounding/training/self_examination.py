@@ -155,9 +155,10 @@ def self_examine(
         )
     policy.eval()
     value.eval()
+    # Before a collector resets the env, so that it remembers the first starts.
+    selection = Selection(env, policy, config.selection, seed, guard, by_agreement)
     learner = Learner(env, policy, value, config, rehearsal)
     sampler_stats(env)  # forgets the reset that a collector begins with
-    selection = Selection(env, policy, config.selection, seed, guard, by_agreement)
     parts: dict[str, Any] = {
         "loss": learner.loss,
         "optimizer": learner.optimizer,

@@ -140,6 +140,14 @@ def exposes_state(env: EnvBase) -> bool:
     return getattr(env, "expose_state", False) or not env.state_spec.is_empty(recurse=True)
 
 
+def instructs(env: EnvBase) -> bool:
+    """Tell whether an environment without transforms brings instructions of its own.
+
+    Workers cannot be asked: transforms in them may bring the instructions.
+    """
+    return not isinstance(env, BatchedEnvBase) and getattr(env, "instructed", False)
+
+
 def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:
     """Key under which a TensorDictModule writes its logit.
 
