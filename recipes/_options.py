@@ -38,7 +38,7 @@ def check(options: DictConfig) -> None:
     """
     world = open_world(options)
     if options.recorded:
-        if not Path(options.recorded).is_dir():
+        if not Path(str(options.recorded)).is_dir():
             raise UserError(f"recorded={options.recorded} is no folder of demonstrations")
         if options.references:
             raise UserError("recorded demonstrations hold no actions: leave references=true out")

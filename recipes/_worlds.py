@@ -163,7 +163,7 @@ def read_recorded(options: DictConfig) -> Demonstrations:
     Raises:
         UserError: where there are none, or they show another world than the simulator's.
     """
-    folder, world = Path(options.recorded), open_world(options)
+    folder, world = Path(str(options.recorded)), open_world(options)
     if (folder / LIST).exists():
         demos = load_pictures(folder, vocabulary=world.vocabulary, progress=shows_progress(options))
     else:
