@@ -33,10 +33,15 @@ def study(options: DictConfig) -> dict:
 
 
 def audit(options: DictConfig) -> list[dict[str, float]]:
-    """Return of every iteration of phase 2 what the picture of the audit shows."""
+    """Return of every iteration of phase 2 what the picture of the audit shows, where it is known.
+
+    An area under a curve is not, where every episode of an audit succeeds.
+    """
     shown = {"step", *(name for lines in PANELS.values() for name in lines)}
     history = read_json(open_run(options) / "metrics" / "self_examine.json")
-    return [{k: round(v, 5) for k, v in row.items() if k in shown} for row in history]
+    return [
+        {k: round(v, 5) for k, v in row.items() if k in shown and v is not None} for row in history
+    ]
 
 
 @recipe_main

@@ -1,4 +1,5 @@
 import json
+import math
 import re
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import torch
 
 from ifo_grounding import networks
 from ifo_grounding.errors import UserError
+from ifo_grounding.files import write_json
 from ifo_grounding.report import results_table
 
 PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
@@ -94,6 +96,12 @@ def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
     for control in ("continue_imitation", "clone_accepted"):
         history = json.loads((tmp_path / "run" / "metrics" / f"{control}.json").read_text())
         assert 0 <= history[-1]["selection_return"] <= 1
+    # An audit in which every episode succeeds knows no area under a curve.
+    from study import audit
+
+    metrics = tmp_path / "run" / "metrics" / "self_examine.json"
+    write_json(metrics, [{"step": 1.0, "judge_auc": math.nan, "success": 1.0, "other": 2.0}])
+    assert audit(options) == [{"step": 1.0, "success": 1.0}]
     [path] = (tmp_path / "results").glob("*.json")
     assert path.name == "move-300-strong-seed0.json"
     assert json.loads(path.read_text())["results"]["cloned"]["outcomes"]
