@@ -1,5 +1,6 @@
 """Write the report of a run: table, curves, chosen instructions and episodes, as one page."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,11 @@ def step_by_step(
     return found
 
 
+def _known(value: float | None) -> float:
+    """Return what was logged; what was not finite is kept as null."""
+    return math.nan if value is None else value
+
+
 def curves(run: Run) -> dict[str, Any]:
     """Plot what was logged, stage by stage."""
     found: dict[str, Any] = {}
@@ -146,7 +152,7 @@ def curves(run: Run) -> dict[str, Any]:
             continue
         history = read_json(path)
         metrics = {
-            name: ([row["step"] for row in history], [row[name] for row in history])
+            name: ([row["step"] for row in history], [_known(row[name]) for row in history])
             for name in wanted
             if all(name in row for row in history)
         }
