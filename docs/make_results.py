@@ -118,7 +118,7 @@ def study_section() -> list[str]:
         " a [t test over seeds](evaluation.md#intervals), of one seed by McNemar's, corrected"
         " (Holm) for the tasks with as many demonstrations. `60-iterations` practises for longer,"
         " from the same phase 1, with 10,000 states whose instructions are"
-        " [chosen once](phase2.md#what-practice-gains-with-few).",
+        " [chosen once](phase2.md#what-practice-gains-with-few); so does `pick-out` with 200.",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table([shown(row, *JUDGED) for row in rows]),
         earlier_note(),
