@@ -25,12 +25,7 @@ from ifo_grounding.report import (
     save_figure,
 )
 from ifo_grounding.report.paper import EPISODES, TABLE_2
-from ifo_grounding.report.results import (
-    brief,
-    commands_note,
-    read_results,
-    restored,
-)
+from ifo_grounding.report.results import brief, commands_note, read_results, restored
 from ifo_grounding.report.results import unpacked as outcomes
 from ifo_grounding.report.tables import folded, renewed
 from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap, wilson
@@ -366,11 +361,7 @@ def over_control(name: str, runs: list[dict[str, Any]]) -> str:
 def earlier(run: Mapping[str, Any]) -> list[str]:
     """Return which options that decide what is learned are others today."""
     said = [text for text in run["command"].split()[3:] if text.partition("=")[0] not in NAMING]
-    return [
-        change
-        for change in changes(run, said)
-        if change.removeprefix("no ").partition(".")[0] in DECISIVE
-    ]
+    return changes(run["options"], said, DECISIVE)
 
 
 def earlier_note() -> str:

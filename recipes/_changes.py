@@ -14,15 +14,21 @@ from omegaconf import DictConfig
 from ifo_grounding.report.results import effective
 
 
-def changes(content: Mapping[str, Any], arguments: Sequence[str] | None = None) -> list[str]:
+def changes(
+    then: Mapping[str, Any], arguments: Sequence[str], sections: Sequence[str] | None = None
+) -> list[str]:
     """Return which options of a run of the recipe `study` would be others today.
 
     Args:
-        content: of its results file.
-        arguments: of the recipe; by default those of its command.
+        then: its options.
+        arguments: of the recipe.
+        sections: of the options to look at; all where None.
     """
-    given = content["command"].split()[3:] if arguments is None else arguments
-    return list(differences(in_effect(content["options"]), in_effect(today(tuple(given)))))
+    both = (
+        {k: v for k, v in each.items() if sections is None or k in sections}
+        for each in (then, today(tuple(arguments)))
+    )
+    return list(differences(*map(in_effect, both)))
 
 
 @functools.cache

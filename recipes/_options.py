@@ -1,11 +1,10 @@
 """Options as a whole: refused before a run begins, and those that a finished run was made with."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from _shared import RUNNING, fit_config, plain, self_examination_config
-from _worlds import Grid, open_world
+from _worlds import Grid, open_world, recorded_folder
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -38,8 +37,7 @@ def check(options: DictConfig) -> None:
     """
     world = open_world(options)
     if options.recorded:
-        if not Path(str(options.recorded)).is_dir():
-            raise UserError(f"recorded={options.recorded} is no folder of demonstrations")
+        recorded_folder(options)
         if options.references:
             raise UserError("recorded demonstrations hold no actions: leave references=true out")
     if isinstance(world, Grid):  # others need the words of their demonstrations first
@@ -60,7 +58,7 @@ def as_made(options: DictConfig) -> DictConfig:
         UserError: where the command names what contradicts how the run was made.
     """
     named = [name.lstrip("+~").split("=")[0] for name in HydraConfig.get().overrides.task]
-    path = Run(str(options.run)) / "options.json"
+    path = Run(options.run) / "options.json"
     return merged(options, read_json(path), named) if path.exists() else options
 
 

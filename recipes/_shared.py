@@ -76,7 +76,7 @@ def open_run(options: DictConfig) -> Run:
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:
         torch.set_num_threads(options.threads)
-    return Run(str(options.run), options.logger)
+    return Run(options.run, options.logger)
 
 
 def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:
@@ -106,6 +106,17 @@ def changed_networks(options: DictConfig) -> dict[str, Any]:
 def shows_progress(options: DictConfig) -> bool:
     """Whether to show progress bars: if asked to, and if somebody can see them move."""
     return options.progress and sys.stderr.isatty()
+
+
+def need_phase_1(run: Run) -> None:
+    """Make sure that a run has a phase-1 policy, of the labels that it has now.
+
+    Raises:
+        UserError: with what to run, where it has not.
+    """
+    run.need(POLICIES[0], "imitate")
+    if not run.is_current("imitate"):
+        raise UserError("phase 1 is of labels that were made anew: run the recipe imitate again")
 
 
 def load_network(run: Run, name: str, recipe: str, options: DictConfig) -> Any:

@@ -13,6 +13,7 @@ from _shared import (
     POLICIES,
     REWARD,
     load_network,
+    need_phase_1,
     open_stage,
     practised_pool,
 )
@@ -20,7 +21,6 @@ from _worlds import Grid, World, open_world
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import (
     Endings,
     SuccessResult,
@@ -55,7 +55,7 @@ def evaluate(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     run = stage.run
-    run.need(POLICIES[0], "imitate")
+    need_phase_1(run)
     named = options.world.get("split")
     if options.evaluate.split == "zero-shot" and named != "train":
         print(
@@ -71,8 +71,6 @@ def evaluate(options: DictConfig) -> dict:
         for name, file in NAMES.items()
         if (run / file).exists() and run.is_current(STAGES[name])
     }
-    if PHASES[0] not in policies:
-        raise UserError("phase 1 is of labels that were made anew: run the recipe imitate again")
     world = open_world(options)
     results |= evaluate_policies(policies, run, world)
     if world.oracle:

@@ -60,7 +60,7 @@ class Piece:
         They are not part of its command, and a file that was made before they changed still counts
         as done: its numbers are those of the options that it holds.
         """
-        return changes(read_json(self.file), self.arguments)
+        return changes(read_json(self.file)["options"], self.arguments)
 
     def make(self) -> int:
         """Make it in a process of its own, at one thread; what it prints goes to a file."""

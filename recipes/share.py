@@ -10,12 +10,12 @@ from _shared import (
     REWARD,
     load_demonstrations,
     load_network,
+    need_phase_1,
     open_run,
 )
 from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.networks import save_pretrained
 from ifo_grounding.report import results_rows
@@ -33,9 +33,7 @@ FILES = {
 
 def share(options: DictConfig) -> list[Path]:
     run = open_run(options)
-    run.need(POLICIES[0], "imitate")
-    if not run.is_current("imitate"):
-        raise UserError("phase 1 is of labels that were made anew: run the recipe imitate again")
+    need_phase_1(run)
     demos = load_demonstrations(run)
     facts = card_facts(run)
     written = []

@@ -43,7 +43,7 @@ def train_phases(options: DictConfig) -> None:
     run = open_run(options)
     check(options)
     if options.base:
-        run.take_over(Run(str(options.base)), without=PHASE_2)
+        run.take_over(Run(options.base), without=PHASE_2)
     write_json(run / "options.json", plain(options))
     # Phase 1: imitation from observation.
     record(options)  # first, for they hold the words of worlds with a vocabulary of their own

@@ -190,24 +190,24 @@ class PickAndPlaceEnv(EnvBase):
         """Keep what the reset shows of all rows, new and running ones.
 
         EnvBase chooses between old and new pixel by pixel, which takes longer than all else in a
-        step. Only where states can be given does the caller know better than the simulator, and
-        only EnvBase knows what to do with entries of others.
+        step. Only where states can be given does the caller know better than the simulator. Entries
+        of others are blank where an episode begins, as EnvBase leaves them.
         """
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is None or mask is None or self.expose_state:
             return super()._reset_proc_data(tensordict, tensordict_reset)
         merged = {name: tensordict_reset[name] for name in self._shown}
-        rest = tensordict.exclude(*self._shown)
         if not set(DONE) <= tensordict.keys():
-            rest = super()._reset_proc_data(rest, tensordict_reset.exclude(*self._shown))
-            return rest.update(merged)
+            rest = tensordict.exclude(*self._shown)
+            rest_reset = tensordict_reset.exclude(*self._shown)
+            return super()._reset_proc_data(rest, rest_reset).update(merged)
         begins = mask.reshape(self.num_envs)
 
         def blank(value: Tensor) -> Tensor:
             """Forget what an episode left that is over: done flags, actions, entries of others."""
             return value.masked_fill(begins.view(-1, *[1] * (value.ndim - 1)), 0)
 
-        return rest.exclude("_reset").apply(blank).update(merged)
+        return tensordict.exclude("_reset", *self._shown).apply(blank).update(merged)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.expose_state and (given := tensordict.get(STATE, None)) is not None:

@@ -158,7 +158,7 @@ def scene_batches(
         env_or_task: name of a task, or an instructed environment to use as it is, seeded anew so
             that its scenes depend on ``seed`` and nothing else. Those of
             :func:`~ifo_grounding.envs.from_gymnasium` have numbers; of others, which are seeded
-            before each batch, ``numbers`` only counts the scenes.
+            before each batch, there are only the first ones.
         numbers: which scenes of the stream.
         seed: of the stream.
         stream: ``training``, ``validation`` or ``evaluation``.
@@ -179,6 +179,11 @@ def scene_batches(
         env, rows = env_or_task, env_or_task.batch_size.numel()
         _check_given(env, env_options)
         if not isinstance(env, GymnasiumEnv):
+            if list(numbers) != [*range(len(numbers))]:
+                raise UserError(
+                    "this environment cannot be reset to a scene by its number: ask for the first "
+                    "ones, range(n), name a task, or use from_gymnasium"
+                )
             yield from _batches_of(env, len(numbers), seed, stream)
             return
         check_choice("stream", stream, STREAMS)

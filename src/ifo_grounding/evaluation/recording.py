@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
+from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import (
     MAX_STEPS,
@@ -89,11 +89,6 @@ def record_episodes(
     options = {"batch_size": len(scenes), "device": where, **env_options}
     if isinstance(env_or_task, str):
         options["max_steps"] = max_steps
-    if not isinstance(env_or_task, (str, GymnasiumEnv)) and list(scenes) != [*range(len(scenes))]:
-        raise UserError(
-            "this environment cannot be reset to a scene by its number: ask for the first ones, "
-            "range(n), name a task, or use from_gymnasium"
-        )
     env, start, _ = next(scene_batches(env_or_task, scenes, seed=seed, stream=stream, **options))
     if env.batch_size.numel() != len(scenes):
         raise UserError(

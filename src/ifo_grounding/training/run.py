@@ -49,10 +49,11 @@ class Run:
                 f"logger={logger} needs the extra of that name: "
                 f"pip install 'ifo-grounding[{logger}]', or use logger=csv"
             )
-        if not str(name):
+        name = str(name)  # options read a name of digits as a number
+        if not name:
             raise UserError("a run needs a name, or the path of its folder")
         given = Path(name).expanduser()
-        is_path = len(given.parts) != 1 or str(name).startswith((".", "~", "/"))
+        is_path = len(given.parts) != 1 or name.startswith((".", "~", "/"))
         self.folder = given if is_path else home() / "runs" / given
         self.logger = logger
 
