@@ -11,8 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
-from _changes import changes, flat
+from _changes import changes, flat, today
 from _shared import plain, result_file
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -50,9 +51,22 @@ class Piece:
 
     @property
     def done(self) -> bool:
-        """Whether its file is there and was made by the same call."""
-        command = " ".join(["ifo-grounding", "run", "study", *self.arguments])
-        return self.file.exists() and read_json(self.file)["command"] == command
+        """Whether its file is there and was made by the same call, or by one that says the same.
+
+        What only one of both says counts as said by the other where its option has that value.
+        """
+        if not self.file.exists():
+            return False
+        made = read_json(self.file)
+        _, _, _, *arguments = made["command"].split()  # ifo-grounding run study
+        said = {each.partition("=")[0] for each in {*arguments} ^ {*self.arguments}}
+        then, now = (flat(each) if said else {} for each in (made["options"], self.today))
+        return said <= then.keys() & now.keys() and all(then[name] == now[name] for name in said)
+
+    @property
+    def today(self) -> dict[str, Any]:
+        """The options that its call has today."""
+        return today(self.arguments)
 
     def changed(self) -> list[str]:
         """Return what today's presets and budgets say otherwise than the options of its file.

@@ -70,6 +70,13 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     second.file.unlink()
     assert reproduce(asked) == []
     assert first.folder.exists() and read_json(second.file)["results"]["phase1"] == after["phase1"]
+    # A call that says what presets and budgets said is the same one.
+    said = options(
+        "figure=6", "tasks=[move]", "presets=[strong]", "+options_of.all.inverse.batch_size=512"
+    )
+    ((told, _),) = pieces(said)
+    assert told.arguments != first.arguments and told.today["inverse"]["batch_size"] == 512
+    assert told.done
     # Other options, another piece.
     ((_, changed),) = pieces(
         options("figure=6", "tasks=[move]", "presets=[strong]", "options_of.all.threads=2")
@@ -113,6 +120,18 @@ def test_an_ablation_changes_one_thing_of_the_whole(options, tmp_path):
     assert before["phase1"] == after["phase1"]
     assert "true_actions" in before and "true_actions" not in after
     assert after["suitability"]["served"]["rate"] == 1.0
+
+
+def test_committed_results_are_done(recipes, monkeypatch):
+    from reproduce import pieces
+
+    asked = ["table=2", "presets=[strong,film]", "ablation=all", "level=all", "seeds=[0,1,2]"]
+    with initialize_config_dir(version_base=None, config_dir=str(recipes / "conf")):
+        chains = pieces(compose("reproduce", asked))
+    monkeypatch.chdir(recipes.parent)
+    found = [piece for chain in chains for piece in chain if piece.file.exists()]
+    assert len(found) > 50
+    assert [piece.file for piece in found if not piece.done] == []
 
 
 def test_levels_of_babyai_are_pieces_by_number_of_demonstrations(options, tmp_path):
