@@ -42,7 +42,10 @@ PAID_FOR_GOALS = "paid for goals"
 SHOWN_CHANGES = ("pairs-5000", GOAL)
 """Pieces whose phase 2 Fig. 6 compares with phase 1."""
 EARLIER = "†"
-EARLIER_NOTE = f"{EARLIER} made with other options than `reproduce` has today; its file names them."
+EARLIER_NOTE = (
+    f"{EARLIER} made with other options than `reproduce` says today; its file names them. What"
+    " presets say may have changed since, too: `reproduce table=2 list=true` says it of each piece."
+)
 OPTIONS_OF: dict[str, Any] = OmegaConf.to_container(  # type: ignore[assignment]
     OmegaConf.load(ROOT / "recipes" / "conf" / "reproduce.yaml").options_of
 )

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from _shared import RUNNING, fit_config, plain, self_examination_config
-from _worlds import Grid, open_world, recorded_folder
+from _worlds import Grid, open_world
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -36,10 +36,8 @@ def check(options: DictConfig) -> None:
         UserError: on a value that its stage would refuse.
     """
     world = open_world(options)
-    if options.recorded:
-        recorded_folder(options)
-        if options.references:
-            raise UserError("recorded demonstrations hold no actions: leave references=true out")
+    if options.recorded and options.references:
+        raise UserError("recorded demonstrations hold no actions: leave references=true out")
     if isinstance(world, Grid):  # others need the words of their demonstrations first
         world.simulator()
     for section in LEARNED:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from torchrl.data import ReplayBuffer
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
+from ifo_grounding.data.pictures import LIST
 from ifo_grounding.errors import UserError
 from ifo_grounding.objectives import SupervisedLoss
 from ifo_grounding.report import format_cell, text_table
@@ -62,7 +64,10 @@ OmegaConf.register_new_resolver("fewer", fewer, replace=True)
 
 
 def open_run(options: DictConfig) -> Run:
-    """Return the run of these options, with torch's threads and memory set."""
+    """Return the run of these options, with torch's threads and memory set.
+
+    Where fewer demonstrations were recorded elsewhere than asked for, the options ask for those.
+    """
     for name in AT_LEAST_ONE:
         if (number := OmegaConf.select(options, name)) is not None and number < 1:
             raise UserError(f"{name} must be at least 1, got {number}")
@@ -72,6 +77,8 @@ def open_run(options: DictConfig) -> Run:
         )
     if str(options.device).startswith("cuda") and not torch.cuda.is_available():
         raise UserError(f"device={options.device}: torch sees no GPU here; use device=cpu")
+    if options.recorded and (number := recorded(options.recorded)) < options.demonstrations.n:
+        options.demonstrations.n = number  # presets ask for it
     keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:
@@ -82,11 +89,11 @@ def open_run(options: DictConfig) -> Run:
 def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:
     """Return a stage that is decided by options or sections of them, the seed and the world."""
     release_freed_memory()  # of the stage before
+    run = open_run(options)
     common = ["task", "seed", "network", "world"]
     decisive = {key: plain(OmegaConf.select(options, key)) for key in [*common, *sections]}
     if changed := changed_networks(options):
         decisive["networks"] = changed  # only then: runs without any go on as they were
-    run = open_run(options)
     stage = run.stage(name, decisive, needs)
     if stage.result is not None:
         doing = "done before"
@@ -96,6 +103,21 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
         doing = "running"
     print(f"{name}: {doing}", flush=True)
     return stage
+
+
+@functools.cache
+def recorded(folder: str) -> int:
+    """Return how many demonstrations a folder holds that were recorded elsewhere.
+
+    Raises:
+        UserError: where there is no such folder, or it is damaged.
+    """
+    path = Path(folder)
+    if not path.is_dir():
+        raise UserError(f"recorded={folder} is no folder of demonstrations")
+    if (listed := path / LIST).exists():
+        return sum(bool(line.strip()) for line in listed.read_text(encoding="utf-8").splitlines())
+    return len(Demonstrations.load(path))
 
 
 def changed_networks(options: DictConfig) -> dict[str, Any]:

@@ -157,25 +157,13 @@ def open_world(options: DictConfig) -> World:
     return WORLDS[options.simulator](options)
 
 
-def recorded_folder(options: DictConfig) -> Path:
-    """Return the folder of demonstrations that were recorded elsewhere.
-
-    Raises:
-        UserError: where there is no such folder.
-    """
-    folder = Path(str(options.recorded))
-    if not folder.is_dir():
-        raise UserError(f"recorded={folder} is no folder of demonstrations")
-    return folder
-
-
 def read_recorded(options: DictConfig) -> Demonstrations:
     """Read demonstrations that were recorded elsewhere, the first ``demonstrations.n`` of them.
 
     Raises:
         UserError: where there are none, or they show another world than the simulator's.
     """
-    folder, world = recorded_folder(options), open_world(options)
+    folder, world = Path(options.recorded), open_world(options)
     if (folder / LIST).exists():
         demos = load_pictures(folder, vocabulary=world.vocabulary, progress=shows_progress(options))
     else:

@@ -198,4 +198,4 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
     [row] = [line for line in text.splitlines() if "| `strong` | 1 | 50.0%" in line]
     first, second = row.split(" | ")[3:5]
     assert "†" not in first and "]†<br>" in second
-    assert text.count("† made with other options than `reproduce` has today") == 1
+    assert text.count("† made with other options than `reproduce` says today") == 1

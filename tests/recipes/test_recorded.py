@@ -43,8 +43,17 @@ def test_what_was_recorded_before_goes_with_its_truth(compose, tmp_path, demos):
     record(compose("record_demonstrations"))
     assert (tmp_path / "run" / "truth").exists()
     demos.save(tmp_path / "shown")
-    found = record(compose("record_demonstrations", f"recorded={tmp_path / 'shown'}"))
+    options = compose(
+        "record_demonstrations",
+        f"recorded={tmp_path / 'shown'}",
+        "demonstrations.n=3000",
+        "preset=strong",
+    )
+    assert options.imitate.prior == 2000
+    found = record(options)
     assert found["demonstrations"] == 40
+    # Those that there are decide how they are learned from, and stand in the results.
+    assert options.demonstrations.n == 40 and options.imitate.prior == 1000
     assert not (tmp_path / "run" / "truth").exists()
 
 
