@@ -25,7 +25,13 @@ from ifo_grounding.report import (
     save_figure,
 )
 from ifo_grounding.report.paper import EPISODES, TABLE_2
-from ifo_grounding.report.results import brief, commands_note, read_results, restored
+from ifo_grounding.report.results import (
+    brief,
+    commands_note,
+    read_results,
+    restored,
+    same_policy,
+)
 from ifo_grounding.report.results import unpacked as outcomes
 from ifo_grounding.report.tables import folded, renewed
 from ifo_grounding.stats import Rate, holm, paired_difference, two_level_bootstrap, wilson
@@ -109,7 +115,9 @@ def study_section() -> list[str]:
         " with 95% intervals of a two-level bootstrap over seeds and scenes; differences are paired"
         " by scene. Where demonstrations were held out, their likelihood stopped phase 1"
         " ([too early](#variants-of-phase-1), as it turned out)."
-        " `continued` and `cloned` are the [controls](phase2.md#controls). p is that of no gain, by"
+        " `continued` and `cloned` are the [controls](phase2.md#controls). `phase 1 kept` says with how"
+        " many seeds no look at what came after phase 1 found it better, so that it is phase 1 that"
+        " is compared. p is that of no gain, by"
         " a [t test over seeds](evaluation.md#intervals), of one seed by McNemar's, corrected"
         " (Holm) for the tasks with as many demonstrations. `60-iterations` practises for longer,"
         " from the same phase 1, with 10,000 states whose instructions are"
@@ -338,7 +346,7 @@ def study_row(key: Key, runs: list[dict[str, Any]], scenes: bool = False) -> dic
         "iterations": runs[0]["options"]["self_examine"]["iterations"],
         "phase 1": brief(two_level_bootstrap(both[0])),
         "phase 2": brief(two_level_bootstrap(both[1])),
-        "gain, points": brief(paired_difference(*both)),
+        "gain, points": brief(paired_difference(*both)) + kept("phase2", runs),
     }
     for name in ("continued", "cloned"):
         row[f"over {name}"] = over_control(name, runs)
@@ -355,7 +363,16 @@ def over_control(name: str, runs: list[dict[str, Any]]) -> str:
     if not having:
         return "not run"
     ahead = brief(paired_difference(outcomes(having, name), outcomes(having, "phase2")))
-    return ahead if len(having) == len(runs) else f"{ahead} ({len(having)} of {len(runs)} seeds)"
+    if len(having) < len(runs):
+        gain = paired_difference(outcomes(having, "phase1"), outcomes(having, "phase2"))
+        ahead += f" ({len(having)} of {len(runs)} seeds, gain {gain.points:+.1f})"
+    return ahead + kept(name, having)
+
+
+def kept(name: str, runs: list[dict[str, Any]]) -> str:
+    """Say with how many seeds a policy is that of phase 1, for nothing after it was kept."""
+    same = sum(same_policy(run, name) for run in runs)
+    return f"; phase 1 kept: {same} of {len(runs)}" if same else ""
 
 
 def earlier(run: Mapping[str, Any]) -> list[str]:

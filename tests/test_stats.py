@@ -178,6 +178,19 @@ def test_paired_difference_of_equal_policies_is_not_surer_than_it_can_be():
     assert difference.low == -difference.high
 
 
+def test_one_scene_that_changed_does_not_narrow_the_interval():
+    before = np.ones(5000, bool)
+    after = before.copy()
+    none = paired_difference(before, after)
+    after[0] = False
+    lost = paired_difference(before, after)
+    upper = scipy_stats.binomtest(1, 5000).proportion_ci().high  # Clopper and Pearson
+    assert lost.low == pytest.approx(-100 * upper)
+    assert lost.low < none.low and 0 < lost.high < none.high
+    seeds = paired_difference(np.stack([before, before]), np.stack([after, before]))
+    assert lost.low < seeds.low < none.low
+
+
 def test_paired_difference_over_seeds_needs_agreement_of_seeds():
     before = np.zeros((2, 200))
     after = np.stack([np.ones(200), np.zeros(200)])  # one seed gains all, the other nothing

@@ -153,6 +153,17 @@ def read_results(
     return found
 
 
+def same_policy(run: Mapping[str, Any], name: str) -> bool:
+    """Whether another policy of a run is the one of phase 1: what came after was not kept.
+
+    >>> run = {"results": {"phase1": {"mean_length": 5.0}, "phase2": {"mean_length": 5.0}}}
+    >>> same_policy(run, "phase2")
+    True
+    """
+    results = run["results"]
+    return results[name] == results["phase1"]
+
+
 def commands_note(groups: Iterable[Sequence[Mapping[str, Any]]]) -> str:
     """Return by which command each run was made, at which commit, as a note that is folded away.
 

@@ -14,6 +14,8 @@ from ifo_grounding.stats.results import Difference, Rate, check_confidence
 
 RESAMPLES = 4000
 """Bootstrap replicates unless told otherwise: bounds are stable to about a tenth of a width."""
+FEW_CHANGES = 10
+"""Scenes that changed, below which a bootstrap of differences is not trusted alone."""
 
 
 def wilson(successes: int, count: int, confidence: float = 0.95) -> Rate:
@@ -127,8 +129,9 @@ def paired_difference(
 ) -> Difference:
     """Compare two policies on the same scenes.
 
-    The interval comes from the two-level bootstrap. Where no scene changed at all, it is the exact
-    one for a share of changes of which none was seen. With one seed ([scenes]) the p-value is
+    The interval comes from the two-level bootstrap. Where fewer than ten scenes changed, which a
+    bootstrap tells little from, it also covers the exact ones (Clopper and Pearson) of how many
+    became better and of how many worse. With one seed ([scenes]) the p-value is
     McNemar's exact test, and speaks of this pair of policies; with several ([seeds, scenes]) it is
     a t test over seeds, whose variance also counts the scenes that they share. Two seeds hardly
     ever pass it, however narrow the interval.
@@ -160,9 +163,11 @@ def paired_difference(
     rng = np.random.default_rng(seed)
     means = _resampled_means(change, resamples, True, rng)
     low, high = (float(q) for q in np.quantile(means, (tail, 1 - tail)))
-    if better + worse == 0:
-        high = 1 - tail ** (1 / change.shape[1])
-        low = -high
+    if better + worse < FEW_CHANGES:
+        up, down = better / len(change), worse / len(change)  # of one seed
+        scenes = change.shape[1]
+        low = min(low, up / scenes - _exact_upper(down, scenes, tail))
+        high = max(high, _exact_upper(up, scenes, tail) - down / scenes)
     if len(change) == 1:
         p_value = 1.0
         if better + worse:
@@ -181,6 +186,11 @@ def paired_difference(
         p_value=p_value,
         method=method,
     )
+
+
+def _exact_upper(count: float, of: int, tail: float) -> float:
+    """Return the upper bound of Clopper and Pearson's interval of a share."""
+    return 1.0 if count >= of else float(scipy_stats.beta.ppf(1 - tail, count + 1, of - count))
 
 
 def _t_test(change: NDArray[np.float64]) -> float:
