@@ -71,6 +71,8 @@ def open_run(options: DictConfig) -> Run:
     for name in AT_LEAST_ONE:
         if (number := OmegaConf.select(options, name)) is not None and number < 1:
             raise UserError(f"{name} must be at least 1, got {number}")
+    if (halvings := options.imitate.get("trial_halvings", 0)) < 0:
+        raise UserError(f"imitate.trial_halvings must not be negative, got {halvings}")
     if (share := options.imitate.held_out) >= 1 or share < 0:
         raise UserError(
             f"imitate.held_out is a share of the demonstrations, in [0, 1), got {share}"
@@ -253,12 +255,13 @@ class Beginning:
         self.tried: list[Metrics] = []
         self.checkpoint = stage.checkpoint.with_stem(f"{stage.checkpoint.stem}-{number}")
 
-    def try_out(self) -> float:
-        """Learn for a few steps, leave a checkpoint to go on from, and return the loss."""
+    def try_out(self, times: int = 1) -> float:
+        """Learn for so many trials, leave a checkpoint to go on from, and return the loss."""
         section = self.options[self.section]
-        history = self.learn(until=section.trial_steps)
+        steps = min(times * section.trial_steps, section.steps)
+        history = self.learn(until=steps)
         iteration = fit_config(section).iteration
-        self.tried = history[: math.ceil(section.trial_steps / iteration)]
+        self.tried = history[: math.ceil(steps / iteration)]
         return self.tried[-1][self.loss.out_keys[0]]
 
     def learn(self, until: int | None = None) -> list[Metrics]:

@@ -1,5 +1,6 @@
 """Imitate the labelled demonstrations: phase 1, which is BCO (paper, 1st-phase)."""
 
+import math
 from collections.abc import Callable
 
 from _shared import (
@@ -56,14 +57,21 @@ def best_beginning(
     held_out: ReplayBuffer | None,
     imitation: Callable[[DictConfig, int], ImitationLoss] = imitation,
 ) -> Beginning:
-    """Try a few initial weights, and return those that imitate best so far."""
+    """Try a few initial weights, and return those that imitate best so far.
+
+    Successive halving (Jamieson and Talwalkar 2016): those of the better half learn on for as many
+    steps, as often as ``imitate.trial_halvings`` says, before the best are chosen.
+    """
 
     def beginning(number: int) -> Beginning:
         loss = imitation(options, beginning_seed(options, number))
         return Beginning(options, stage, "imitate", loss, seen, number, held_out)
 
     beginnings = [beginning(number) for number in range(options.imitate.trials)]
-    return min(beginnings, key=lambda beginning: beginning.try_out())
+    for times in range(1, options.imitate.get("trial_halvings", 0) + 2):
+        losses = {each: each.try_out(times) for each in beginnings}
+        beginnings = sorted(losses, key=lambda each: losses[each])[: math.ceil(len(losses) / 2)]
+    return beginnings[0]
 
 
 def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, ReplayBuffer | None]:

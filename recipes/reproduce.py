@@ -53,7 +53,8 @@ class Piece:
     def done(self) -> bool:
         """Whether its file is there and was made by the same call, or by one that says the same.
 
-        What only one of both says counts as said by the other where its option has that value.
+        What only one of both says counts as said by the other where its option has that value, or
+        where there was no such option and it does nothing.
         """
         if not self.file.exists():
             return False
@@ -61,7 +62,9 @@ class Piece:
         _, _, _, *arguments = made["command"].split()  # ifo-grounding run study
         said = {each.partition("=")[0] for each in {*arguments} ^ {*self.arguments}}
         then, now = (flat(each) if said else {} for each in (made["options"], self.today))
-        return said <= then.keys() & now.keys() and all(then[name] == now[name] for name in said)
+        return said <= now.keys() and all(
+            then[name] == now[name] if name in then else not now[name] for name in said
+        )
 
     @property
     def today(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import torch
 
 from ifo_grounding import networks
 from ifo_grounding.errors import UserError
-from ifo_grounding.files import write_json
+from ifo_grounding.files import read_json, write_json
 from ifo_grounding.report import results_table
 
 PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
@@ -289,9 +289,42 @@ def test_the_log_begins_with_the_trials(compose, tmp_path):
     assert [line.split(",")[0] for line in file.read_text().split()] == ["10", "20"]
 
 
+def test_the_better_half_of_the_beginnings_is_tried_for_longer(compose, tmp_path):
+    import imitate
+    from collect_transitions import collect
+    from label import label
+    from record_demonstrations import record
+    from train_inverse import train_inverse
+
+    tried = ["imitate.trials=5", "imitate.trial_steps=10", "imitate.steps=40"]
+    options = compose("imitate", *tried, "imitate.trial_halvings=1")
+    for stage in (record, collect, train_inverse, label):
+        stage(options)
+    asked = []
+
+    class Watched(imitate.Beginning):
+        def try_out(self, times=1):
+            loss = super().try_out(times)
+            asked.append((times, self.number, loss))
+            return loss
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(imitate, "Beginning", Watched)
+        found = imitate.imitate(options)
+    first = sorted((loss, number) for times, number, loss in asked if times == 1)
+    second = sorted((loss, number) for times, number, loss in asked if times == 2)
+    assert len(first) == 5 and len(asked) == 8
+    assert {number for _, number in second} == {number for _, number in first[:3]}
+    assert found["beginning"] == second[0][1]
+    history = read_json(tmp_path / "run" / "metrics" / "imitate.json")
+    assert [each["step"] for each in history] == [10, 20, 30, 40]
+    assert history[1]["loss_imitation"] == second[0][0]
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
+        ("imitate.trial_halvings=-1", "trial_halvings must not be negative"),
         ("imitate.trials=0", "imitate.trials must be at least 1"),
         ("instruction.trial_steps=0", "instruction.trial_steps must be at least 1"),
         ("imitate.held_out=2", r"a share of the demonstrations, in \[0, 1\)"),

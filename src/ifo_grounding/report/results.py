@@ -96,7 +96,7 @@ def effective(section: Mapping[str, Any]) -> dict[str, Any]:
     >>> effective({"steps": 300, "trials": 1, "trial_steps": 50})
     {'steps': 300}
     """
-    alone = ("trials", "trial_steps") if section.get("trials", 1) == 1 else ()
+    alone = ("trials", "trial_steps", "trial_halvings") if section.get("trials", 1) == 1 else ()
     return {name: value for name, value in section.items() if name not in alone}
 
 
