@@ -77,7 +77,11 @@ def open_run(options: DictConfig) -> Run:
         raise UserError(
             f"imitate.held_out is a share of the demonstrations, in [0, 1), got {share}"
         )
-    if str(options.device).startswith("cuda") and not torch.cuda.is_available():
+    try:
+        device = torch.device(options.device)
+    except RuntimeError:
+        raise UserError(f"device={options.device} is none: use cpu, cuda or cuda:0") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
         raise UserError(f"device={options.device}: torch sees no GPU here; use device=cpu")
     if options.recorded and (number := recorded(options.recorded)) < options.demonstrations.n:
         options.demonstrations.n = number  # presets ask for it
@@ -141,6 +145,19 @@ def need_phase_1(run: Run) -> None:
     run.need(POLICIES[0], "imitate")
     if not run.is_current("imitate"):
         raise UserError("phase 1 is of labels that were made anew: run the recipe imitate again")
+
+
+def need_current(run: Run, stages: Sequence[str]) -> None:
+    """Make sure that stages are done, and that nothing that they build on was made anew since.
+
+    Raises:
+        UserError: with what to run, where one is not.
+    """
+    for name in stages:
+        if run.record(name) and not run.is_current(name):
+            raise UserError(
+                f"{name} builds on what was made anew since: run the recipe {name} again"
+            )
 
 
 def load_network(run: Run, name: str, recipe: str, options: DictConfig) -> Any:

@@ -26,7 +26,7 @@ from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
 from ifo_grounding.data.pictures import LIST
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv, from_gymnasium
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.tasks import VOCABULARY, Vocabulary
+from ifo_grounding.tasks import VOCABULARY, Vocabulary, grammar
 from ifo_grounding.world import Layout
 
 ROOMS = 256
@@ -180,6 +180,10 @@ def read_recorded(options: DictConfig) -> Demonstrations:
                 f"frames in {folder} are {list(demos.image_shape)}, those of the simulator "
                 f"{list(shown)}: set world.tile_size and world.layout.size as they were recorded"
             )
+        try:
+            grammar(world.task).parse_tokens(demos.pool())
+        except UserError as error:
+            raise UserError(f"{folder} is of another task: {error}; say task=...") from None
     return demos[: options.demonstrations.n]
 
 

@@ -66,11 +66,15 @@ def evaluate(options: DictConfig) -> dict:
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
     labels = run.record("label")["result"].get("accuracy")
     results: dict[str, Any] = {"labels": labels} if labels else {}
-    policies = {
-        name: load_network(run, file, "imitate", options)
-        for name, file in NAMES.items()
-        if (run / file).exists() and run.is_current(STAGES[name])
-    }
+    there = [name for name, file in NAMES.items() if (run / file).exists()]
+    current = [name for name in there if run.is_current(STAGES[name])]
+    for name in sorted({*there} - {*current}):
+        print(
+            f"note: {name} builds on what was made anew since, and is left out: run the recipe "
+            f"{STAGES[name]} again",
+            file=sys.stderr,
+        )
+    policies = {name: load_network(run, NAMES[name], "imitate", options) for name in current}
     world = open_world(options)
     results |= evaluate_policies(policies, run, world)
     if world.oracle:

@@ -12,6 +12,7 @@ from _shared import (
     load_demonstrations,
     load_labels,
     load_network,
+    need_current,
     open_stage,
     practised_pool,
     self_examination_config,
@@ -40,6 +41,7 @@ def examine(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     run = stage.run
+    need_current(run, needs(options))
     policy = load_network(run, POLICIES[0], "imitate", options)
     context = context_of(options, "imitate")
     value = build(networks.make_value, options, init_from=policy, context=context)

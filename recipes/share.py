@@ -12,6 +12,7 @@ from _shared import (
     load_network,
     need_phase_1,
     open_run,
+    plain,
 )
 from omegaconf import DictConfig
 
@@ -35,7 +36,7 @@ def share(options: DictConfig) -> list[Path]:
     run = open_run(options)
     need_phase_1(run)
     demos = load_demonstrations(run)
-    facts = card_facts(run)
+    facts = card_facts(run, options)
     written = []
     for name, files in FILES.items():
         current = [file for made_by, file in files.items() if run.is_current(made_by)]
@@ -51,27 +52,27 @@ def share(options: DictConfig) -> list[Path]:
     return written
 
 
-def card_facts(run: Run) -> dict[str, object]:
+def card_facts(run: Run, options: DictConfig) -> dict[str, object]:
     """Return what a model card says of a run: task, data, results, and the command.
 
     Nothing where the results are those of networks that were made anew since.
     """
-    path = run / "result.json"
-    if not path.exists() or not run.is_current("evaluate"):
+    if not run.is_current("evaluate"):
         return {}
-    found = read_json(path)
-    options = found["options"]
-    results = {
-        row["measured"]: row["result [95% interval]"] for row in results_rows(found["results"])
+    measured = run.record("evaluate")["result"]
+    path = run / "result.json"
+    written = read_json(path) if path.exists() else {}
+    made = written.get("options") or plain(options)
+    facts: dict[str, object] = {
+        "Task": made["task"],
+        "Demonstrations": f"{made['demonstrations']['n']:,}",
+        "Seed": made["seed"],
+        **{row["measured"]: row["result [95% interval]"] for row in results_rows(measured)},
     }
-    return {
-        "Task": options["task"],
-        "Demonstrations": f"{options['demonstrations']['n']:,}",
-        "Seed": options["seed"],
-        **results,
-        "Command": f"`{found['command']}`",
-        "Commit": found["provenance"]["commit"],
-    }
+    if written.get("results") == measured:
+        facts["Command"] = f"`{written['command']}`"
+        facts["Commit"] = written["provenance"]["commit"]
+    return facts
 
 
 @recipe_main

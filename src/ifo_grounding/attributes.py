@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import MutableMapping
 from typing import Any
+from weakref import WeakKeyDictionary
 
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.errors import UserError
@@ -15,23 +17,44 @@ STOP_ACTION = "stop_action"
 def attribute(source: Any, name: str) -> Any:
     """Return a plain attribute; a vector env that answers per worker must agree with itself."""
     try:
-        value = getattr(source, name, None)
-        answers = list(value) if isinstance(value, (list, tuple)) else [value]
+        value = getattr(_answering(source), name, None)
+        answers: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
     except Exception:  # a closed or remote env may fail in many ways; its specs then speak
         return None
     if name == "image_shape":
+        if answers and all(isinstance(answer, (list, tuple)) for answer in answers):
+            answers = list(answers[0]) if all(each == answers[0] for each in answers) else []
         return tuple(answers) if len(answers) == 3 else None
     answer = answers[0] if answers else None
     same = all(other == answer for other in answers)
     return answer if same and isinstance(answer, int) else None
 
 
+def _answering(source: Any) -> Any:
+    """Return what can be asked without harm.
+
+    A worker in another process ends at a name that it does not know, so a first worker is made here
+    and asked instead. Workers of this process cannot answer before they are started.
+    """
+    base = source
+    while isinstance(base, TransformedEnv):
+        base = base.base_env
+    if isinstance(base, ParallelEnv):
+        if base not in _FIRST_WORKERS:
+            _FIRST_WORKERS[base] = base.create_env_fn[0](**base.create_env_kwargs[0])
+        return _FIRST_WORKERS[base]
+    if isinstance(base, BatchedEnvBase) and base.is_closed:
+        base.start()
+    return source
+
+
+_FIRST_WORKERS: MutableMapping[EnvBase, EnvBase] = WeakKeyDictionary()
+
+
 def says_stop(env: EnvBase) -> bool:
     """Whether an environment says which action is its stop, be it that it has none."""
-    if isinstance(env, BatchedEnvBase) and env.is_closed:
-        env.start()  # it could not answer
     try:
-        return hasattr(env, STOP_ACTION)
+        return hasattr(_answering(env), STOP_ACTION)
     except Exception:  # of a remote one
         return False
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from torchrl.data import Categorical, OneHot
-from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 from ifo_grounding.data import Collected, Demonstrations, RandomActions, collect_transitions
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -34,6 +36,18 @@ def test_actions_explain_what_changed():
     moved = (after == 255).all(1).flatten(1).float().argmax(1) - corners
     step = torch.tensor([-6, 1, 6, -1, 0, 0])
     assert torch.equal(moved, step[action])
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
+def test_stops_are_kept_of_workers_in_processes(wrap):
+    worker = partial(PickAndPlaceEnv, "pick", num_envs=4, seed=0, instructed=False)
+    workers = wrap(ParallelEnv(2, worker, mp_start_method="fork"))
+    try:
+        report = collect_transitions(workers, 400, seed=0).report
+    finally:
+        workers.close()
+    assert int(report.kept[5]) == int(report.taken[5]) > 0
 
 
 def test_everything_is_kept_on_request():

@@ -7,7 +7,8 @@ import hashlib
 import pytest
 import torch
 from torch import nn
-from torchrl.envs import RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, Unbounded
+from torchrl.envs import EnvBase, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import ExplorationType, RandomPolicy, exploration_type
 
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -225,3 +226,42 @@ def test_comparison_is_paired_and_refuses_other_scenes(make_expert, random_polic
     sampled = success_rate(random_policy, "move", episodes=100, mode="sampled")
     with pytest.raises(UserError, match="cannot compare"):
         compare_success(worse, sampled)
+
+
+class Patient(EnvBase):
+    """Succeeds at its sixtieth step."""
+
+    def __init__(self):
+        super().__init__(batch_size=[2])
+        pixels = Bounded(0, 255, (2, 3, 8, 8), dtype=torch.uint8)
+        words = Bounded(0, 8, (2, 16), dtype=torch.int64)
+        self.observation_spec = Composite(pixels=pixels, instruction=words, shape=(2,))
+        self.action_spec = Categorical(6, shape=(2,))
+        self.reward_spec = Unbounded((2, 1))
+        self.full_done_spec = Composite(done=Binary(1, (2, 1), dtype=torch.bool), shape=(2,))
+
+    def _reset(self, tensordict=None):
+        self.steps = 0
+        return self.observation_spec.zero().set("done", torch.zeros(2, 1, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        self.steps += 1
+        ended = torch.full((2, 1), self.steps == 60)
+        return self.observation_spec.zero().update({"reward": ended.float(), "done": ended})
+
+    def _set_seed(self, seed):
+        pass
+
+
+def test_other_worlds_end_by_themselves():
+    wait = lambda td: td.set("action", torch.zeros(td.shape, dtype=torch.int64))  # noqa: E731
+    assert success_rate(wait, Patient(), episodes=4).rate.rate == 1.0
+    assert success_rate(wait, Patient(), episodes=4, max_steps=59).rate.rate == 0.0
+
+
+def test_actions_of_another_shape_are_refused():
+    one_hot = Patient()
+    one_hot.action_spec = OneHot(6, shape=(2, 6))
+    wait = lambda td: td.set("action", torch.zeros(td.shape, dtype=torch.int64))  # noqa: E731
+    with pytest.raises(UserError, match=r"shape \[2\].*takes \[2, 6\].*categorical_action"):
+        success_rate(wait, one_hot, episodes=2)

@@ -1,10 +1,12 @@
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 import torch
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
-from torchrl.envs import RenameTransform, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import ParallelEnv, RenameTransform, SerialEnv, StepCounter, TransformedEnv
 
+from ifo_grounding.attributes import stop_of
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import Shapes, make_inverse, make_policy
@@ -113,8 +115,22 @@ def test_a_vector_of_envs_says_what_its_specs_say():
     assert Shapes.of(env).image_shape == (3, 48, 48)
     assert Shapes.of(env).vocabulary_size == len(VOCABULARY)
     bare = SerialEnv(2, lambda: PickAndPlaceEnv("move", num_envs=2, instructed=False))
-    with pytest.raises(UserError, match="cannot read vocabulary_size from SerialEnv"):
-        Shapes.of(bare)
+    assert Shapes.of(bare) == Shapes.of(PickAndPlaceEnv("move", num_envs=2))  # asked, it starts
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
+def test_workers_in_processes_are_asked(wrap):
+    worker = partial(PickAndPlaceEnv, "move", num_envs=2, instructed=False)
+    workers = wrap(ParallelEnv(3, worker, mp_start_method="fork"))  # none is started
+    assert Shapes.of(workers) == Shapes.of(worker())
+    assert stop_of(workers, "a test") == 5
+
+
+def test_one_hot_actions_are_refused():
+    env = PickAndPlaceEnv("move", num_envs=2)
+    env.action_spec = OneHot(6, shape=(2, 6))
+    with pytest.raises(UserError, match="categorical_action_encoding=True"):
+        make_policy(env)
 
 
 def test_a_policy_acts_in_the_real_env():

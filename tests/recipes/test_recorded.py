@@ -63,6 +63,7 @@ def test_what_was_recorded_before_goes_with_its_truth(compose, tmp_path, demos):
         (["world.tile_size=16"], r"are \[3, 48, 48\], those of the simulator \[3, 96, 96\]"),
         (["references=true"], "recorded demonstrations hold no actions"),
         (["recorded=nowhere"], "recorded=nowhere is no folder"),
+        (["task=pick"], r"is of another task: .* is no sentence of pick; .*say task="),
     ],
 )
 def test_recorded_demonstrations_have_to_fit(compose, tmp_path, demos, said, refused):

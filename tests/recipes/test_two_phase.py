@@ -321,9 +321,52 @@ def test_the_better_half_of_the_beginnings_is_tried_for_longer(compose, tmp_path
     assert history[1]["loss_imitation"] == second[0][0]
 
 
+def test_a_card_says_what_was_measured_last(compose, tmp_path):
+    from evaluate import evaluate
+    from imitate import imitate
+    from share import share
+    from two_phase import two_phase
+
+    two_phase(compose("two_phase", "phase2=false"))
+    longer = ["phase2=false", "imitate.steps=30"]
+    imitate(compose("imitate", *longer))
+    measured = evaluate(compose("evaluate", *longer, "evaluate.episodes=40"))
+    share(compose("share", f"to={tmp_path / 'shared'}"))
+    card = (tmp_path / "shared" / "policy" / "README.md").read_text()
+    count = measured["phase1"]["rate"]["count"]
+    assert count == 40 and f"(n={count})" in card and "Command" not in card
+
+
+def test_practice_on_stale_judges_is_refused_and_said_to_be_left_out(compose, tmp_path, capsys):
+    from evaluate import evaluate
+    from imitate import imitate
+    from self_examine import examine
+    from two_phase import two_phase
+
+    two_phase(compose("two_phase"))
+    longer = "imitate.steps=30"
+    imitate(compose("imitate", longer))
+    with pytest.raises(UserError, match="run the recipe train_instruction again"):
+        examine(compose("self_examine", longer))
+    capsys.readouterr()
+    assert "phase2" not in evaluate(compose("evaluate", longer))
+    assert "phase2 builds on what was made anew since, and is left out" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
+        ("imitate.lr=-1", "lr must be above 0, got -1"),
+        ("device=gpu", "device=gpu is none: use cpu, cuda or cuda:0"),
+        ("self_examine.gamma=2", r"gamma must be within 0..1, got 2"),
+        ("self_examine.clip=-1", "clip must be above 0"),
+        ("self_examine.entropy=-1", "entropy must not be negative"),
+        ("evaluate.mode=foo", "evaluate.mode"),
+        ("evaluate.stream=foo", "evaluate.stream"),
+        ("evaluate.episodes=0", "evaluate.episodes must be at least 1, got 0"),
+        ("evaluate.states=-1", "evaluate.states must not be negative"),
+        ("transitions.stop_probability=2", "transitions.stop_probability must be within 0..1"),
+        ("demonstrations.n=0", "demonstrations.n must be at least 1"),
         ("imitate.trial_halvings=-1", "trial_halvings must not be negative"),
         ("imitate.trials=0", "imitate.trials must be at least 1"),
         ("instruction.trial_steps=0", "instruction.trial_steps must be at least 1"),

@@ -188,6 +188,26 @@ def test_on_a_replay_buffer():
     assert torch.allclose(sample["next", "learned_reward"], stops * torch.tensor(SURE))
 
 
+def test_on_a_replay_buffer_the_stop_may_be_asked_of_the_environment():
+    world = CounterWorld((6,), max_steps=12)
+    world.stop_action = STOP
+    reward = LearnedReward(goal_judge(), kind="goal")
+    env = make(reward, world=world)
+    rollout = env.rollout(30, expert, break_when_any_done=False).reshape(-1)
+
+    def filled(transform):
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=64)
+        buffer.append_transform(transform)
+        buffer.extend(rollout.exclude(("next", "learned_reward")))
+        return buffer
+
+    sample = filled(LearnedReward(goal_judge(), kind="goal").ask(env)).sample()
+    stops = (sample["action"] == STOP).unsqueeze(-1)
+    assert torch.allclose(sample["next", "learned_reward"], stops * torch.tensor(SURE))
+    with pytest.raises(UserError, match="a batch does not say which action is the stop"):
+        filled(LearnedReward(goal_judge(), kind="goal")).sample()
+
+
 def test_large_batches_are_scored_in_parts():
     sizes = []
     judge = TensorDictModule(

@@ -47,7 +47,8 @@ def from_gymnasium(
 
     The world has to show an image of bytes and to take actions of a ``Discrete`` space; its
     instruction is a sentence in the observation or in ``info``. Episodes end as the world says,
-    and its reward is the true one: for evaluation alone, and withheld where ``instructed=False``.
+    and its reward is the true one: for evaluation alone, which counts an episode as a success where
+    its last step pays more than 0, and withheld where ``instructed=False``.
 
     Args:
         world: id for :func:`gymnasium.make`, or a function that makes the world (then give it all

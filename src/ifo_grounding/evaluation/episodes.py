@@ -19,6 +19,8 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import STREAMS, derive
 
 MAX_STEPS = 40
+MAX_STEPS_OF_OTHERS = 1000
+"""Most actions in an environment that is given, whose episodes end by themselves mostly."""
 MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
 """How actions are chosen: the likeliest, or drawn from the policy's distribution."""
 
@@ -119,8 +121,21 @@ def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor
     shape = (env.batch_size.numel(), *every.shape[len(env.batch_size) :])
     action = every.reshape(shape).clone()
     chosen = policy(state.reshape(shape[0])[active])[env.action_key]
+    if chosen.shape != (wanted := torch.Size([len(active), *shape[1:]])):
+        raise UserError(
+            f"the policy's actions of {len(active)} rows have the shape {list(chosen.shape)}, the "
+            f"environment takes {list(wanted)}: make it with categorical_action_encoding=True if "
+            "it is one-hot, or a policy for it"
+        )
     action[active] = chosen.to(action)
     return action.reshape(every.shape)
+
+
+def most_steps(env_or_task: EnvBase | str, max_steps: int | None) -> int:
+    """Return the most actions of an episode: as said, or those of a task or of an environment."""
+    if max_steps is not None:
+        return max_steps
+    return MAX_STEPS if isinstance(env_or_task, str) else MAX_STEPS_OF_OTHERS
 
 
 class SceneHash:

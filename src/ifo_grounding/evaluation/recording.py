@@ -16,9 +16,9 @@ from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import (
-    MAX_STEPS,
     Policy,
     device_of,
+    most_steps,
     play,
     scene_batches,
     seeded,
@@ -54,7 +54,7 @@ def record_episodes(
     seed: int = 0,
     stream: str = "evaluation",
     mode: str = "greedy",
-    max_steps: int = MAX_STEPS,
+    max_steps: int | None = None,
     render_tile_size: int | None = None,
     device: torch.device | str | None = None,
     **env_options: Any,
@@ -72,7 +72,8 @@ def record_episodes(
         seed: of the stream.
         stream: ``training``, ``validation`` or ``evaluation``.
         mode: ``greedy`` or ``sampled``.
-        max_steps: most actions per episode.
+        max_steps: most actions per episode, one that has not ended by then is a failure; by default
+            40 for a task's name, and 1,000 in an environment, whose own limit may be lower.
         render_tile_size: size of a cell in the kept frames, for people (16 or 32), for a task's
             name; what the policy sees where None.
         device: where to run; the policy's by default.
@@ -87,8 +88,9 @@ def record_episodes(
         return []
     where = torch.device(device) if device is not None else device_of(policy)
     options = {"batch_size": len(scenes), "device": where, **env_options}
+    limit = most_steps(env_or_task, max_steps)
     if isinstance(env_or_task, str):
-        options["max_steps"] = max_steps
+        options["max_steps"] = limit
     env, start, _ = next(scene_batches(env_or_task, scenes, seed=seed, stream=stream, **options))
     if env.batch_size.numel() != len(scenes):
         raise UserError(
@@ -117,7 +119,7 @@ def record_episodes(
             actions[row].append(action)
 
     with evaluating(policy), seeded(derive(seed, "record", mode), where):
-        outcomes = play(policy, env, start, mode=mode, max_steps=max_steps, on_step=keep)
+        outcomes = play(policy, env, start, mode=mode, max_steps=limit, on_step=keep)
     return [
         Episode(
             frames=np.stack(frames[row]),

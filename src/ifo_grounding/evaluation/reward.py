@@ -16,9 +16,9 @@ from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import (
-    MAX_STEPS,
     Policy,
     device_of,
+    most_steps,
     play,
     scene_batches,
     seeded,
@@ -181,7 +181,7 @@ def return_correlation(
     average: bool = False,
     batch_size: int = 1000,
     device: torch.device | str | None = None,
-    max_steps: int = MAX_STEPS,
+    max_steps: int | None = None,
     **env_options: Any,
 ) -> ReturnAudit:
     """Compare the learned return of rollouts with their true success.
@@ -201,13 +201,15 @@ def return_correlation(
         average: whether to divide by the length: a sum of probabilities pays for long episodes.
         batch_size: episodes side by side.
         device: where to run; the policy's by default.
-        max_steps: most actions per episode.
+        max_steps: most actions per episode, one that has not ended by then is a failure; by default
+            40 for a task's name, and 1,000 in an environment, whose own limit may be lower.
         env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
     """
     pay = reward if isinstance(reward, LearnedReward) else LearnedReward(reward)
     where = torch.device(device) if device is not None else device_of(policy)
+    limit = most_steps(env_or_task, max_steps)
     if isinstance(env_or_task, str):
-        env_options["max_steps"] = max_steps
+        env_options["max_steps"] = limit
     batches = scene_batches(
         env_or_task,
         range(episodes),
@@ -226,7 +228,7 @@ def return_correlation(
                 env,
                 start,
                 mode=mode,
-                max_steps=max_steps,
+                max_steps=limit,
                 on_step=_purse(
                     pay.ask(env), start.reshape(-1)[keys.PIXELS].clone(), total, discount
                 ),

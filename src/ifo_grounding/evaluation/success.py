@@ -13,11 +13,11 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.evaluation.episodes import (
-    MAX_STEPS,
     MODES,
     Outcomes,
     Policy,
     device_of,
+    most_steps,
     play,
     play_scenes,
     scene_batches,
@@ -71,14 +71,15 @@ def success_rate(
     stream: str = "evaluation",
     batch_size: int = 1000,
     device: torch.device | str | None = None,
-    max_steps: int = MAX_STEPS,
+    max_steps: int | None = None,
     **env_options: Any,
 ) -> SuccessResult:
     """Measure how often a policy fulfils its instruction: one episode per fixed scene.
 
-    The same seed and stream give the same scenes, whatever the policy, the mode and the batch
-    size; :attr:`SuccessResult.scenes` is their hash. The policy runs in eval mode and without
-    gradients, and its modes are as before afterwards; so are torch's global generators.
+    An episode is a success where the step that ends it pays a true reward above 0. The same seed
+    and stream give the same scenes, whatever the policy, the mode and the batch size;
+    :attr:`SuccessResult.scenes` is their hash. The policy runs in eval mode and without gradients,
+    and its modes are as before afterwards; so are torch's global generators.
 
     Args:
         policy: writes an action into a tensordict, a TensorDictModule mostly.
@@ -91,7 +92,8 @@ def success_rate(
         stream: ``evaluation`` for results, ``validation`` for choices.
         batch_size: episodes side by side, for a task's name.
         device: where to run, for a task's name; the policy's by default.
-        max_steps: most actions per episode.
+        max_steps: most actions per episode, one that has not ended by then is a failure; by default
+            40 for a task's name, and 1,000 in an environment, whose own limit may be lower.
         env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`, such as
             ``tile_size`` and ``split``.
 
@@ -107,13 +109,14 @@ def success_rate(
     if episodes < 1 or batch_size < 1:
         raise UserError(f"episodes and batch_size must be positive, got {episodes}, {batch_size}")
     options = {"seed": seed, "stream": stream, "batch_size": batch_size, **env_options}
+    limit = most_steps(env_or_task, max_steps)
     if isinstance(env_or_task, str):
-        options["max_steps"] = max_steps
+        options["max_steps"] = limit
     options["device"] = torch.device(device) if device is not None else device_of(policy)
 
     def measure(how: str) -> SuccessResult:
         return _measure(
-            policy, scene_batches(env_or_task, range(episodes), **options), how, seed, max_steps
+            policy, scene_batches(env_or_task, range(episodes), **options), how, seed, limit
         )
 
     if mode == "both":

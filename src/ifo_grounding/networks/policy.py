@@ -16,7 +16,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from ifo_grounding import keys
 from ifo_grounding.networks.building import Shareable, blueprint, check_keys, construct
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.shapes import Shapes, check_categorical
 from ifo_grounding.networks.transfer import copy_weights, trunk_of
 from ifo_grounding.networks.trunk import InstructedNetwork
 
@@ -74,7 +74,8 @@ def make_policy(
         overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
 
     Raises:
-        UserError: for an unknown preset or option, or sizes that cannot be read.
+        UserError: for an unknown preset or option, sizes that cannot be read, or an environment of
+            one-hot actions.
 
     >>> from tensordict import TensorDict
     >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
@@ -86,6 +87,7 @@ def make_policy(
     (torch.Size([2]), torch.Size([2]))
     """
     check_keys(in_keys, ("image", "instruction"))
+    check_categorical(spec_source)
     options = {
         "in_keys": list(in_keys),
         "action_key": action_key,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tensordict.utils import NestedKey
-from torchrl.data import Unbounded
+from torchrl.data import OneHot, Unbounded
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
@@ -81,6 +81,20 @@ n_actions=6, tile_size=None)
         return cls(**{name: value for name, value in found.items() if value is not None})
 
 
+def check_categorical(source: Any) -> None:
+    """Refuse an environment of one-hot actions, for policies here give their numbers.
+
+    Raises:
+        UserError: on one, as TorchRL's wrappers of Gymnasium are by default.
+    """
+    specs = getattr(source, "full_action_spec", None)
+    if specs is not None and any(isinstance(spec, OneHot) for spec in specs.values(True, True)):
+        raise UserError(
+            "the environment takes one-hot actions, and policies here give their numbers: make it "
+            "with categorical_action_encoding=True"
+        )
+
+
 def patch_size(shapes: Shapes, config: NetworkConfig) -> int:
     """Return the side of a patch: as configured, or the side of a tile, or 8 pixels."""
     return config.patch_size or shapes.tile_size or 8
@@ -101,7 +115,8 @@ def _from_specs(
     if actions is not None:
         names = list(actions.keys(True, True))
         if action in names or len(names) == 1:
-            found.append(("n_actions", _count(actions[action if action in names else names[0]])))
+            spec = actions[action if action in names else names[0]]
+            found.append(("n_actions", _count(spec)))
     return found
 
 

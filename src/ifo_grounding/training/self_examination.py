@@ -88,6 +88,15 @@ class SelfExaminationConfig:
         for name in (*counts, "checkpoint_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("lr", "value_lr", "clip", "grad_clip"):
+            if getattr(self, name) <= 0:
+                raise UserError(f"{name} must be above 0, got {getattr(self, name)}")
+        for name in ("gamma", "lmbda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UserError(f"{name} must be within 0..1, got {getattr(self, name)}")
+        for name in ("entropy", "kl", "value_warmup", "select_every", "evaluate_every"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
 
     @property
     def selection(self) -> SelectionSchedule:

@@ -74,6 +74,8 @@ class FitConfig:
         for name in ("steps", "batch_size", "iteration", "validate_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.lr <= 0:
+            raise UserError(f"lr must be above 0, got {self.lr}")
         for name in ("weight_decay", "prior"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")

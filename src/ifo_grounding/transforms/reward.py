@@ -145,8 +145,15 @@ class LearnedReward(EpisodeTransform):
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Belong to an environment, which is asked for its stop when it is needed."""
-        self._named = None
         super().set_container(container)
+        if self._lives_in_an_environment():
+            self._named = None
+
+    def _lives_in_an_environment(self) -> bool:
+        try:
+            return self.container is not None
+        except ValueError:  # how TorchRL says that it is in something else, such as a buffer
+            return False
 
     def ask(self, env: EnvBase) -> LearnedReward:
         """Ask an environment for its stop where that matters, to pay batches collected there."""
@@ -241,7 +248,8 @@ class LearnedReward(EpisodeTransform):
         if isinstance(self.stop_action, int):
             return self.stop_action
         if self._named is None:
-            self._named = stop_of(self.parent if self.container else None, type(self).__name__)
+            env = self.parent if self._lives_in_an_environment() else None
+            self._named = stop_of(env, type(self).__name__)
         return self._named
 
     def _rows(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
