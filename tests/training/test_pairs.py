@@ -86,6 +86,16 @@ def test_nothing_suitable_is_one_clear_line():
         select_pairs(CounterWorld((4,)), classifier(), POOL, 5, threshold=0.99)
 
 
+def test_a_search_that_would_take_forever_is_given_up():
+    def seldom(pixels, instruction):  # one picture of some thousand
+        return (pixels.flatten(1).sum(1, keepdim=True) // 10 % 1000 == 7) * 18.0 - 9.0
+
+    rare = TensorDictModule(seldom, ["pixels", "instruction"], ["suitability"])
+    env = PickAndPlaceEnv("move", num_envs=2048, seed=0, instructed=False)
+    with pytest.raises(NothingSuitableError, match=r"only \d+ of 20,480 states.*find 1,000 pairs"):
+        select_pairs(env, rare, torch.ones(1, 16).long(), 1000)
+
+
 def test_environments_that_do_not_suit_are_refused():
     with pytest.raises(UserError, match="use instructed=False"):
         select_pairs(CounterWorld((4,), instructed=True), classifier(), POOL, 5)

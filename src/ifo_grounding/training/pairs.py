@@ -25,6 +25,8 @@ SCORE = "score"
 """Key of the probability that a stored pair is suitable, float32 [N, 1]."""
 FRUITLESS_RESETS = 100
 """Resets in a row that may serve no state before the search is given up."""
+JUDGED_STATES, LEAST_SERVED = 20_000, 0.002
+"""States from which on the search is given up where a smaller share than this is served."""
 
 
 def select_pairs(
@@ -61,7 +63,8 @@ def select_pairs(
 
     Raises:
         UserError: on a simulator that does not number its scenes, or an impossible option.
-        NothingSuitableError: where 100 resets in a row bring no suitable pair.
+        NothingSuitableError: where 100 resets in a row bring no suitable pair, or 20,000 states
+            fewer than 40.
 
     >>> from tensordict.nn import TensorDictModule
     >>> from ifo_grounding.envs import PickAndPlaceEnv
@@ -83,7 +86,7 @@ def select_pairs(
     scorer = PoolScorer(classifier, check_pool(pool).unique(dim=0))
     source = generator(seed, "select-pairs")
     found: list[TensorDict] = []
-    count, fruitless, best_score = 0, 0, 0.0
+    count, seen, fruitless, best_score = 0, 0, 0, 0.0
     with tqdm(total=n, desc="pairs", disable=not progress) as bar:
         while count < n:
             pixels = env.reset()[PIXELS].flatten(0, -4)
@@ -104,6 +107,14 @@ def select_pairs(
                     f"no instruction of the pool scored above {threshold} on any of the last "
                     f"{fruitless * len(pixels)} states (best score seen: {best_score:.2f}): lower "
                     "threshold, raise candidates, or train the classifier longer"
+                )
+            seen += len(pixels)
+            if seen >= JUDGED_STATES and count + len(rows) < LEAST_SERVED * seen:
+                raise NothingSuitableError(
+                    f"only {count + len(rows)} of {seen:,} states got an instruction that scored "
+                    f"above {threshold} (best score seen: {best_score:.2f}), too few to find "
+                    f"{n:,} pairs: lower threshold, raise candidates, or train the classifier or "
+                    "the policy that it begins with longer"
                 )
             found.append(_pairs(env.scene_numbers.flatten(), pixels, choices, scorer.pool, rows))
             count += len(rows)
