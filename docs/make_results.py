@@ -214,6 +214,7 @@ def imitation_section() -> list[str]:
                     "steps": f"{options['imitate']['steps']:,}",
                     "held out": f"{options['imitate']['held_out']:.0%}",
                     "seed": options["seed"],
+                    "scenes": f"{success['rate']['count']:,} {options['evaluate']['stream']}",
                     "greedy": brief(restored(Rate, success["rate"])),
                     "sampled": brief(restored(Rate, success["sampled"]["rate"])),
                 }
@@ -223,8 +224,8 @@ def imitation_section() -> list[str]:
     return [
         "## Variants of phase 1",
         "When to [stop imitating](phase1.md#when-to-stop), and with and without the"
-        " [prior](phase1.md#few-demonstrations), in batches of other sizes: success on 4,000 or"
-        " 5,000 validation scenes.",
+        " [prior](phase1.md#few-demonstrations), in batches of other sizes, from the best of six or"
+        " of twelve beginnings.",
         markdown_table(rows),
         commands_note(found.values()),
     ]
