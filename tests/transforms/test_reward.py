@@ -134,6 +134,9 @@ def test_one_hot_actions_are_understood():
     })  # fmt: skip
     paid = goal_reward()(batch)["next", "learned_reward"]
     assert paid.flatten().tolist() == pytest.approx([SURE, 0.0])
+    judge = LearnedReward(action_judge())
+    by_number = judge(batch.clone().update({"action": torch.tensor([2, 0])}))
+    assert torch.equal(judge(batch)["next", "learned_reward"], by_number["next", "learned_reward"])
 
 
 def test_initial_pixels_last_the_episode_and_begin_anew():

@@ -202,6 +202,9 @@ class LearnedReward(EpisodeTransform):
         reached = torch.zeros(rows, dtype=torch.bool)
         if self.action_judge is not None:
             entries = {key: self._rows(before, key) for key in self.action_judge.in_keys}
+            for key in entries:
+                if unravel_key(key) == self.action_key:
+                    entries[key] = numbers(entries[key])
             logit = self._score(self.action_judge, self.action_logit, entries, rows)
             reward = reward + self.action_weight * formed(logit, self.form)
         if self.goal_judge is not None:
@@ -238,10 +241,7 @@ class LearnedReward(EpisodeTransform):
             )
         if self.stop_action is None:
             return self._rows(after, "terminated").reshape(rows).bool()
-        action = self._rows(before, self.action_key)
-        if action.ndim > 1 and action.shape[-1] > 1:
-            action = action.argmax(-1)
-        return action.reshape(rows) == self._stop
+        return numbers(self._rows(before, self.action_key)).reshape(rows) == self._stop
 
     @property
     def _stop(self) -> int:
@@ -306,6 +306,15 @@ class LearnedReward(EpisodeTransform):
         if self.judges_goals:
             state_spec[self.initial_pixels_key] = observations[self.pixels_key].clone()
         return state_spec
+
+
+def numbers(action: Tensor) -> Tensor:
+    """Return the numbers of actions, which may be one-hot.
+
+    >>> numbers(torch.tensor([[0, 0, 1], [1, 0, 0]])).tolist()
+    [2, 0]
+    """
+    return action.argmax(-1) if action.ndim > 1 and action.shape[-1] > 1 else action
 
 
 def formed(logit: Tensor, form: str) -> Tensor:
