@@ -47,9 +47,6 @@ LEARNED = PICTURE.with_name("babyai.png")
 EFFICIENCY = PICTURE.with_name("efficiency.png")
 FEW = 2000
 """Demonstrations up to which the README shows a study: with more there is little left to gain."""
-LONGER = "strong, 60-iterations"
-STRONG = ("strong", LONGER)
-"""The preset, and the same that practises for longer, as studies of their own."""
 HACKED = ROOT / "results" / "study" / "move-200-film-action-centred-seed0.json"
 NAMES = {
     "phase1": "phase 1",
@@ -119,9 +116,9 @@ def study_section() -> list[str]:
         " how many seeds no look at what came after phase 1 found it better, so that it is phase 1"
         " that is compared. p is that of no gain, by"
         " a [t test over seeds](evaluation.md#intervals), of one seed by McNemar's, corrected"
-        " (Holm) for the tasks with as many demonstrations. `60-iterations` practises for longer,"
-        " from the same phase 1, with 10,000 states whose instructions are"
-        " [chosen once](phase2.md#what-practice-gains-with-few); so does `pick-out` with 200.",
+        " (Holm) for the tasks with as many demonstrations. Practice of 60 iterations is with"
+        " 10,000 states whose instructions are"
+        " [chosen once](phase2.md#what-practice-gains-with-few).",
         f"![Success of each policy, with intervals](assets/{PICTURE.name})",
         markdown_table([shown(row, *JUDGED) for row in rows]),
         earlier_note(),
@@ -329,7 +326,7 @@ def practised(variants: bool = False) -> dict[Key, list[dict[str, Any]]]:
     return {
         key: runs
         for key, runs in studies().items()
-        if "phase2" in runs[0]["results"] and (", " in key[2] and key[2] != LONGER) == variants
+        if "phase2" in runs[0]["results"] and (", " in key[2]) == variants
     }
 
 
@@ -418,10 +415,10 @@ def efficient() -> dict[str, dict[int, dict[str, Rate]]]:
 
     def add(task: str, n: int, runs: list[dict[str, Any]]) -> None:
         rates = {name: two_level_bootstrap(outcomes(runs, name)) for name in PHASES}
-        found.setdefault(task, {})[n] = rates  # of what practises for longer, where both are there
+        found.setdefault(task, {})[n] = rates
 
     for (task, n, kind, held_out), runs in practised().items():
-        if kind in STRONG and not held_out:
+        if kind == "strong" and not held_out:
             add(task, n, runs)
     found = {task: by for task, by in found.items() if len(by) > 1}
     tabled = read_results(
@@ -522,7 +519,7 @@ def readme(text: str) -> str:
     """Return the README with its tables of studies and of BabyAI renewed."""
     aside = ("preset", "scenes", *JUDGED)
     found = zip(practised(), study_rows(), strict=True)
-    few = [row for (_, n, kind, _), row in found if n <= FEW and kind in STRONG]
+    few = [row for (_, n, kind, _), row in found if n <= FEW and kind == "strong"]
     rows = [shown(row, *aside) for row in few]
     said = "made with other options than `strong` has today: [which](docs/results.md#studies)."
     note = f"\n{EARLIER} {said}\n" if any(EARLIER in str(row["seeds"]) for row in rows) else ""
