@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from _shared import RUNNING, fit_config, plain, self_examination_config
+from _learning import fit_config, self_examination_config
+from _shared import RUNNING, plain
 from _worlds import Grid, open_world
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -46,29 +47,16 @@ def check(options: DictConfig) -> None:
     for section in LEARNED:
         fit_config(options[section])
     self_examination_config(options.self_examine)
-    check_counts(options)
-    chosen = options.instruction
-    check_options(chosen.threshold, chosen.candidates, chosen.choose)
-
-
-def check_counts(options: DictConfig) -> None:
-    """Refuse scenes, demonstrations and random steps that cannot be.
-
-    Raises:
-        UserError: on the first of them.
-    """
     section = options.evaluate
     check_choice("evaluate.mode", section.mode, [*MODES, "both"])
     check_choice("evaluate.stream", section.stream, STREAMS)
     check_choice("evaluate.split", section.split, SPLITS)
-    counts = ("demonstrations.n", "transitions.n", "transitions.num_envs", "self_examine.num_envs")
-    for name in (*counts, "evaluate.episodes", "evaluate.audit_episodes"):
-        if (number := OmegaConf.select(options, name)) < 1:
-            raise UserError(f"{name} must be at least 1, got {number}")
     if section.states < 0:
         raise UserError(f"evaluate.states must not be negative, got {section.states}")
     if (share := options.transitions.stop_probability) is not None and not 0 <= share <= 1:
         raise UserError(f"transitions.stop_probability must be within 0..1, got {share}")
+    chosen = options.instruction
+    check_options(chosen.threshold, chosen.candidates, chosen.choose)
 
 
 def as_made(options: DictConfig) -> DictConfig:

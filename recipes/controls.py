@@ -5,15 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from _shared import (
-    CONTROLS,
-    POLICIES,
-    load_network,
-    open_stage,
-    self_examination_config,
-    tell,
-    train,
-)
+from _learning import self_examination_config, train
+from _shared import CONTROLS, POLICIES, load_network, open_stage, tell
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig, OmegaConf
 from self_examine import guard_of, judge_learns, needs, practice

@@ -3,15 +3,8 @@
 import math
 from collections.abc import Callable
 
-from _shared import (
-    POLICIES,
-    Beginning,
-    beginning_seed,
-    load_demonstrations,
-    load_labels,
-    open_stage,
-    tell,
-)
+from _learning import Beginning, beginning_seed
+from _shared import POLICIES, load_demonstrations, load_labels, open_stage, tell
 from _worlds import build, context_of
 from omegaconf import DictConfig
 from torch import Tensor

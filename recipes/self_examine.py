@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from _audit import audit_callback
+from _learning import self_examination_config
 from _shared import (
     CLASSIFIER,
     GOAL,
@@ -15,7 +16,6 @@ from _shared import (
     need_current,
     open_stage,
     practised_pool,
-    self_examination_config,
     shows_progress,
     tell,
 )
@@ -41,7 +41,6 @@ def examine(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     run = stage.run
-    need_current(run, needs(options))
     policy = load_network(run, POLICIES[0], "imitate", options)
     context = context_of(options, "imitate")
     value = build(networks.make_value, options, init_from=policy, context=context)
@@ -99,7 +98,12 @@ def needs(options: DictConfig) -> list[str]:
 def practice(
     run: Run, options: DictConfig
 ) -> tuple[TransformedEnv, LearnedReward, Adversary | None]:
-    """Return the env to practise in, its reward and, where that is to be trained on, what does."""
+    """Return the env to practise in, its reward and, where that is to be trained on, what does.
+
+    Raises:
+        UserError: where a judge or the choice of instructions is of another phase 1.
+    """
+    need_current(run, needs(options))
     reward, adversary = learned_reward(run, options)
     simulator = open_world(options).simulator(options.self_examine.num_envs)
     env = TransformedEnv(simulator, Compose(chosen_starts(run, options), reward))

@@ -1,6 +1,7 @@
 """Train the goal judge: whether an instruction is fulfilled (an extension of the paper)."""
 
-from _shared import GOAL, load_demonstrations, open_stage, starting_policy, tell, train
+from _learning import train
+from _shared import GOAL, load_demonstrations, open_stage, starting_policy, tell
 from _worlds import build, context_of
 from omegaconf import DictConfig
 

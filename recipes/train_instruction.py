@@ -3,15 +3,8 @@
 import math
 
 import torch
-from _shared import (
-    CLASSIFIER,
-    Beginning,
-    beginning_seed,
-    load_demonstrations,
-    open_stage,
-    starting_policy,
-    tell,
-)
+from _learning import Beginning, beginning_seed
+from _shared import CLASSIFIER, load_demonstrations, open_stage, starting_policy, tell
 from _worlds import build, context_of, open_world
 from omegaconf import DictConfig
 from torch import Tensor

@@ -1,6 +1,7 @@
 """Train the inverse module: which action lies between two frames (paper, 1st-phase)."""
 
-from _shared import INVERSE, RANDOM_STEPS, open_stage, tell, train
+from _learning import train
+from _shared import INVERSE, RANDOM_STEPS, open_stage, tell
 from _worlds import build
 from omegaconf import DictConfig
 

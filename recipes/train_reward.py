@@ -1,14 +1,7 @@
 """Train the reward module: which actions are right (paper, 2nd-phase)."""
 
-from _shared import (
-    REWARD,
-    load_demonstrations,
-    load_labels,
-    open_stage,
-    starting_policy,
-    tell,
-    train,
-)
+from _learning import train
+from _shared import REWARD, load_demonstrations, load_labels, open_stage, starting_policy, tell
 from _worlds import build, context_of
 from omegaconf import DictConfig
 

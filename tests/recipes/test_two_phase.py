@@ -220,7 +220,7 @@ def test_the_instruction_module_tries_the_policys_roles_and_sees_fresh_states(co
 
 @pytest.mark.parametrize(("preset", "schedule"), [("paper", "constant"), ("film", "cosine")])
 def test_the_papers_learning_rate_does_not_decay(compose, preset, schedule):
-    from _shared import fit_config
+    from _learning import fit_config
 
     options = compose("two_phase", f"preset={preset}")
     for section in ("inverse", "imitate", "instruction", "reward", "goal"):

@@ -165,6 +165,7 @@ def scene_batches(
     stream: str,
     batch_size: int,
     device: torch.device,
+    max_steps: int = MAX_STEPS,
     **env_options: Any,
 ) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
     """Yield environments reset to the scenes with the given numbers, batch by batch.
@@ -179,6 +180,7 @@ def scene_batches(
         stream: ``training``, ``validation`` or ``evaluation``.
         batch_size: rows of an environment made here.
         device: of an environment made here.
+        max_steps: of an environment made here.
         env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
 
     Yields:
@@ -188,7 +190,13 @@ def scene_batches(
     if isinstance(env_or_task, str):
         rows = min(batch_size, len(numbers))
         env = PickAndPlaceEnv(
-            env_or_task, num_envs=rows, device=device, seed=seed, stream=stream, **env_options
+            env_or_task,
+            num_envs=rows,
+            device=device,
+            seed=seed,
+            stream=stream,
+            max_steps=max_steps,
+            **env_options,
         )
     else:
         env, rows = env_or_task, env_or_task.batch_size.numel()

@@ -88,9 +88,7 @@ def record_episodes(
         return []
     where = torch.device(device) if device is not None else device_of(policy)
     options = {"batch_size": len(scenes), "device": where, **env_options}
-    limit = most_steps(env_or_task, max_steps)
-    if isinstance(env_or_task, str):
-        options["max_steps"] = limit
+    options["max_steps"] = limit = most_steps(env_or_task, max_steps)
     env, start, _ = next(scene_batches(env_or_task, scenes, seed=seed, stream=stream, **options))
     if env.batch_size.numel() != len(scenes):
         raise UserError(

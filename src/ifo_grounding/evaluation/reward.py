@@ -208,8 +208,6 @@ def return_correlation(
     pay = reward if isinstance(reward, LearnedReward) else LearnedReward(reward)
     where = torch.device(device) if device is not None else device_of(policy)
     limit = most_steps(env_or_task, max_steps)
-    if isinstance(env_or_task, str):
-        env_options["max_steps"] = limit
     batches = scene_batches(
         env_or_task,
         range(episodes),
@@ -217,6 +215,7 @@ def return_correlation(
         stream=stream,
         batch_size=batch_size,
         device=where,
+        max_steps=limit,
         **env_options,
     )
     paid, won = [], []

@@ -109,9 +109,7 @@ def success_rate(
     if episodes < 1 or batch_size < 1:
         raise UserError(f"episodes and batch_size must be positive, got {episodes}, {batch_size}")
     options = {"seed": seed, "stream": stream, "batch_size": batch_size, **env_options}
-    limit = most_steps(env_or_task, max_steps)
-    if isinstance(env_or_task, str):
-        options["max_steps"] = limit
+    options["max_steps"] = limit = most_steps(env_or_task, max_steps)
     options["device"] = torch.device(device) if device is not None else device_of(policy)
 
     def measure(how: str) -> SuccessResult:

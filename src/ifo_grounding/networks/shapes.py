@@ -115,8 +115,7 @@ def _from_specs(
     if actions is not None:
         names = list(actions.keys(True, True))
         if action in names or len(names) == 1:
-            spec = actions[action if action in names else names[0]]
-            found.append(("n_actions", _count(spec)))
+            found.append(("n_actions", _count(actions[action if action in names else names[0]])))
     return found
 
 
