@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -91,9 +93,16 @@ def test_a_search_that_would_take_forever_is_given_up():
         return (pixels.flatten(1).sum(1, keepdim=True) // 10 % 1000 == 7) * 18.0 - 9.0
 
     rare = TensorDictModule(seldom, ["pixels", "instruction"], ["suitability"])
-    env = PickAndPlaceEnv("move", num_envs=2048, seed=0, instructed=False)
-    with pytest.raises(NothingSuitableError, match=r"only \d+ of 20,480 states.*find 1,000 pairs"):
-        select_pairs(env, rare, torch.ones(1, 16).long(), 1000)
+
+    def search(n):
+        env = PickAndPlaceEnv("move", num_envs=2048, seed=0, instructed=False)
+        return select_pairs(env, rare, torch.ones(1, 16).long(), n)
+
+    message = r"only (\d+) of 20,480 states.*find 1,000 pairs"
+    with pytest.raises(NothingSuitableError, match=message) as given_up:
+        search(1000)
+    found = int(re.search(message, str(given_up.value))[1])
+    assert len(search(found)) == found < 40  # enough, however rare
 
 
 def test_environments_that_do_not_suit_are_refused():

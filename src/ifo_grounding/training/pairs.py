@@ -100,6 +100,7 @@ def select_pairs(
                 generator=source,
             )
             rows = (choices.chosen >= 0).nonzero().squeeze(-1)[: n - count]
+            seen, count = seen + len(pixels), count + len(rows)
             fruitless = 0 if len(rows) else fruitless + 1
             best_score = max(best_score, float(choices.score.max()))
             if fruitless >= FRUITLESS_RESETS:
@@ -108,16 +109,14 @@ def select_pairs(
                     f"{fruitless * len(pixels)} states (best score seen: {best_score:.2f}): lower "
                     "threshold, raise candidates, or train the classifier longer"
                 )
-            seen += len(pixels)
-            if seen >= JUDGED_STATES and count + len(rows) < LEAST_SERVED * seen:
+            if seen >= JUDGED_STATES and count < min(n, LEAST_SERVED * seen):
                 raise NothingSuitableError(
-                    f"only {count + len(rows)} of {seen:,} states got an instruction that scored "
+                    f"only {count} of {seen:,} states got an instruction that scored "
                     f"above {threshold} (best score seen: {best_score:.2f}), too few to find "
                     f"{n:,} pairs: lower threshold, raise candidates, or train the classifier or "
                     "the policy that it begins with longer"
                 )
             found.append(_pairs(env.scene_numbers.flatten(), pixels, choices, scorer.pool, rows))
-            count += len(rows)
             bar.update(len(rows))
     return torch.cat(found)
 
