@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import MutableMapping
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -15,7 +16,11 @@ STOP_ACTION = "stop_action"
 
 
 def attribute(source: Any, name: str) -> Any:
-    """Return a plain attribute; a vector env that answers per worker must agree with itself."""
+    """Return a plain attribute; a vector env that answers per worker must agree with itself.
+
+    Raises:
+        UserError: for a stop that is no action's number, or another one in some workers.
+    """
     try:
         value = getattr(_answering(source), name, None)
         answers: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
@@ -26,8 +31,17 @@ def attribute(source: Any, name: str) -> Any:
             answers = list(answers[0]) if all(each == answers[0] for each in answers) else []
         return tuple(answers) if len(answers) == 3 else None
     answer = answers[0] if answers else None
-    same = all(other == answer for other in answers)
-    return answer if same and isinstance(answer, int) else None
+    try:
+        number = None if answer is None else operator.index(answer)
+        said = all(other == answer for other in answers)
+    except TypeError:
+        number, said = None, False
+    if name == STOP_ACTION and not said:
+        raise UserError(
+            f"the environment's {STOP_ACTION} is {value!r}: it is the number of an action, the "
+            "same in all worlds, or None where no action ends an episode"
+        )
+    return number if said else None
 
 
 def _answering(source: Any) -> Any:

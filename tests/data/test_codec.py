@@ -217,3 +217,13 @@ def test_frames_may_begin_anywhere_in_a_buffer():
     buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), frames.flatten()])
     codec = FrameCodec.fit(frames, 8)
     assert torch.equal(codec.encode(buffer[3:].view_as(frames)), codec.encode(frames))
+
+
+def test_pieces_may_be_written_to_again_when_they_were_given():
+    def pieces():
+        piece = torch.empty(4, 3, 30, 30, dtype=torch.uint8)  # no tile divides it
+        for number in range(3):
+            yield piece.fill_(number)
+
+    codec, codes = FrameCodec.compress(pieces())
+    assert codec.tiles is None and codes[:, 0, 0, 0].tolist() == [0] * 4 + [1] * 4 + [2] * 4

@@ -530,3 +530,16 @@ def test_a_damaged_or_foreign_folder_is_refused_with_what_is_wrong(name, tmp_pat
         Demonstrations.load(folder)
     assert str(folder) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("close", [False, True])
+def test_a_generator_may_write_to_its_array_again(close):
+    def recorded():
+        frames = np.empty((3, 3, 32, 32), np.uint8)
+        for number in range(4):
+            frames[0], frames[1:] = number, number + 100  # the stop is shown
+            yield number, frames, "go up"
+
+    demos = Demonstrations.from_episodes(recorded(), close=close)
+    shown = [demos[number]["pixels"][:, 0, 0, 0].tolist() for number in range(4)]
+    assert shown == [[number, number + 100, number + 100] for number in range(4)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torchrl.data import Categorical, OneHot
@@ -13,6 +14,7 @@ from ifo_grounding.data import Collected, Demonstrations, RandomActions, collect
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.world import Layout
+from transforms.counter_world import STOP, CounterWorld
 
 
 def make_env(num_envs: int = 16, **options) -> PickAndPlaceEnv:
@@ -197,3 +199,25 @@ def test_folders_of_others_are_left_alone(tmp_path):
     for _ in range(2):  # an older one is replaced
         found.save(link)
     assert link.is_symlink() and len(Collected.load(tmp_path / "made").buffer) == len(found.buffer)
+
+
+@pytest.mark.parametrize("stop", [np.int64(5), torch.tensor(5)])
+def test_a_stop_may_be_any_whole_number(stop):
+    env = make_env()
+    env.stop_action = stop
+    report = collect_transitions(env, 400, seed=0).report
+    assert report.kept[5] == report.taken[5] > 0
+
+
+def test_who_does_not_say_which_action_is_the_stop_is_asked():
+    env = make_env()
+    env.stop_action = "press"
+    with pytest.raises(UserError, match="stop_action is 'press': it is the number of an action"):
+        collect_transitions(env, 10)
+    silent = CounterWorld((4,))
+    with pytest.raises(UserError, match="does not say which action is its stop"):
+        collect_transitions(silent, 10)
+    every = collect_transitions(silent, 40, drop_unchanged=False).report
+    assert torch.equal(every.kept, every.taken)
+    report = collect_transitions(silent, 40, stop_action=STOP).report
+    assert report.kept[STOP] == report.taken[STOP]

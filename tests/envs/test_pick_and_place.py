@@ -530,3 +530,18 @@ def test_a_copied_or_moved_env_goes_on(change):
         assert (step == same).all()
         wanted = env.simulator.wanted.clone(), other.simulator.wanted.clone()
         assert (wanted[0] == wanted[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("actions", "said"),
+    [
+        ([0, 6, 1], r"actions are 0\.\.5 here, got 0\.\.6"),
+        ([-1, 0, 0], r"actions are 0\.\.5 here, got -1\.\.0"),
+        ([0.0, 1.0, 2.0], "one integer for each of 3 worlds, got torch.float32"),
+        ([[1], [2], [3]], r"got torch\.int64 of shape \[3, 1\]"),
+    ],
+)
+def test_other_actions_are_refused(actions, said):
+    env = PickAndPlaceEnv("move", num_envs=3, seed=0)
+    with pytest.raises(UserError, match=said):
+        env.step(env.reset().set("action", torch.tensor(actions)))

@@ -271,6 +271,13 @@ def test_actions_that_the_world_has_not_are_refused(stop, action):
         env.step(env.reset().set("action", torch.tensor([0, action])))
 
 
+@pytest.mark.parametrize("actions", [[[0, 1, 0], [1, 0, 0]], [[0], [1]], [0.0, 1.0]])
+def test_actions_are_one_whole_number_each(actions):
+    env = dials(2)
+    with pytest.raises(UserError, match="one integer for each of 2 worlds"):
+        env.step(env.reset().set("action", torch.tensor(actions)))
+
+
 @pytest.mark.parametrize(("stop", "named"), [(None, None), (PRESS, PRESS), ("add", 3)])
 def test_it_says_which_action_is_the_stop(stop, named):
     env = dials(20, stop=stop, instructed=False)

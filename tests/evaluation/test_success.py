@@ -6,9 +6,17 @@ import hashlib
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, Unbounded
-from torchrl.envs import EnvBase, RewardSum, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import (
+    EnvBase,
+    RenameTransform,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.utils import ExplorationType, RandomPolicy, exploration_type
 
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -16,6 +24,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import compare_success, success_rate
 from ifo_grounding.networks import make_policy
 from ifo_grounding.tasks import TASKS
+from ifo_grounding.transforms import LearnedReward
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -265,3 +274,20 @@ def test_actions_of_another_shape_are_refused():
     wait = lambda td: td.set("action", torch.zeros(td.shape, dtype=torch.int64))  # noqa: E731
     with pytest.raises(UserError, match=r"shape \[2\].*takes \[2, 6\].*categorical_action"):
         success_rate(wait, one_hot, episodes=2)
+
+
+def test_success_is_seen_from_the_true_reward_where_there_are_others():
+    def up(td):
+        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
+
+    judge = TensorDictModule(
+        lambda action: torch.zeros(*action.shape, 1), ["action"], ["action_score"]
+    )
+    plain, paid = (PickAndPlaceEnv("move", num_envs=100, seed=0) for _ in range(2))
+    paid = TransformedEnv(paid, LearnedReward(judge))
+    result = success_rate(up, paid, episodes=200)
+    assert torch.equal(result.outcomes, success_rate(up, plain, episodes=200).outcomes)
+    assert 0 < result.rate.successes < 20
+    renamed = TransformedEnv(paid, RenameTransform(["reward"], ["pay"]))
+    with pytest.raises(UserError, match="success is seen from the true reward, named 'reward'"):
+        success_rate(up, renamed, episodes=20)

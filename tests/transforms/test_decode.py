@@ -139,3 +139,60 @@ def test_it_moves_samples_to_where_it_is(frames):
     assert sample["pixels"].device.type == sample["name"].device.type == "meta"
     assert sample["pixels"].shape == (4, 3, 48, 48)
     assert sample["name"].dtype == torch.float32
+
+
+def numbered(*numbers: int) -> torch.Tensor:
+    """Images of one colour each, which are one tile."""
+    column = torch.tensor(numbers, dtype=torch.uint8).view(-1, 1, 1, 1)
+    return column.expand(-1, 3, 16, 16).contiguous()
+
+
+def stores(codec: FrameCodec, **options) -> TensorDictReplayBuffer:
+    decoder = FrameDecoder(codec, ["pixels"], **options)
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(12), transform=decoder)
+
+
+def test_a_loaded_buffer_goes_on_and_leaves_the_codec_it_was_made_with():
+    first, second = numbered(0, 1, 2), numbered(3, 4, 5)
+    saved = stores(FrameCodec.fit([first, second]))
+    saved.extend(TensorDict({"pixels": first}, [3]))
+    codec = FrameCodec.fit([second, first])  # the same tiles in another order
+    loaded = stores(codec)
+    loaded.load_state_dict(saved.state_dict())
+    loaded.extend(TensorDict({"pixels": second}, [3]))
+    assert torch.equal(loaded[:]["pixels"], torch.cat([first, second]))
+    assert torch.equal(codec.decode(codec.encode(first)), first)
+
+
+def test_a_table_of_frames_is_not_overwritten_by_that_of_others():
+    one, other = (FrameCodec.compress(numbered(*numbers)) for numbers in ((0, 1), (2, 3)))
+    buffers = []
+    for codec, codes in (one, other):
+        buffers.append(stores(codec, frames=codes))
+        buffers[-1].extend(TensorDict({"pixels": torch.arange(2)}, [2]))
+    buffers[1].load_state_dict(buffers[0].state_dict())
+    assert torch.equal(buffers[1][:]["pixels"], numbered(2, 3))
+    assert torch.equal(other[0].decode(other[1]), numbered(2, 3))
+
+
+def test_a_buffer_follows_a_dictionary_that_grows_as_long_as_numbers_fit():
+    codec = FrameCodec.fit(numbered(0))
+    buffer = stores(codec)
+    buffer.extend(TensorDict({"pixels": numbered(0)}, [1]))
+    with pytest.raises(UserError, match="not in the dictionary"):
+        buffer.extend(TensorDict({"pixels": numbered(1)}, [1]))
+    codec.update(numbered(1))
+    buffer.extend(TensorDict({"pixels": numbered(1)}, [1]))
+    assert torch.equal(buffer[:]["pixels"], numbered(0, 1))
+    codec.update(torch.randint(256, (80, 3, 16, 16), dtype=torch.uint8))
+    with pytest.raises(UserError, match=r"grown beyond the numbers of type torch\.uint8"):
+        buffer.extend(TensorDict({"pixels": numbered(0)}, [1]))
+
+
+def test_codes_under_another_key_are_stored_alone():
+    pixels = numbered(0, 1, 2)
+    decoder = FrameDecoder(FrameCodec.fit(pixels), ["codes"], ["pixels"])
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(3), transform=decoder)
+    buffer.extend(TensorDict({"pixels": pixels}, [3]))
+    assert "pixels" not in buffer.storage.get(slice(None))
+    assert torch.equal(buffer[:]["pixels"], pixels)

@@ -8,10 +8,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, RewardSum, TransformedEnv
+from torchrl.envs import Compose, RewardSum, ToTensorImage, TransformedEnv
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
+from ifo_grounding.transforms.reward import numbers
 from transforms.counter_world import (
     POOL,
     STOP,
@@ -310,3 +311,27 @@ def test_missing_entries_are_named():
     rollout = make(LearnedReward(action_judge())).rollout(5)
     with pytest.raises(UserError, match="'initial_pixels': collect with LearnedReward"):
         goal_reward()(rollout)
+
+
+def test_boolean_one_hot_actions_have_numbers():
+    action = torch.tensor([[False, True, False], [True, False, False]])
+    assert numbers(action).tolist() == [1, 0]
+
+
+def test_images_that_a_later_transform_changes_are_refused():
+    def stepped(**options):
+        later = ToTensorImage(in_keys=["pixels"], shape_tolerant=True, **options)
+        return make(LearnedReward(action_judge())).append_transform(later).rollout(2)
+
+    with pytest.raises(UserError, match=r"after LearnedReward changes \['pixels'\]"):
+        stepped()
+    assert stepped(out_keys=["shown"])["shown"].dtype == torch.float32
+
+
+def test_the_instruction_may_be_chosen_by_a_later_transform():
+    def paid(*transforms):
+        env = TransformedEnv(CounterWorld((6,), max_steps=12), Compose(*transforms))
+        return env.rollout(9, expert, break_when_any_done=False)["next", "learned_reward"]
+
+    sampler, reward = InstructionSampler(classifier(), POOL), LearnedReward(action_judge())
+    assert torch.equal(paid(reward, sampler), paid(reward.clone(), sampler.clone()))

@@ -292,3 +292,14 @@ def test_without_a_simulator_no_state_is_drawn_again():
     first = TensorDict({"pixels": torch.full((1, 3, 8, 8), 180, dtype=torch.uint8)}, [1])
     with pytest.raises(UserError, match="needs an environment"):
         sampler._reset(first.empty(), first)
+
+
+def test_another_classifier_may_take_the_place_of_the_first():
+    env = make()
+    env.transform.classifier = TensorDictModule(
+        lambda pixels, instruction: torch.full((len(pixels), 1), -9.0),
+        ["pixels", "instruction"],
+        ["suitability"],
+    )
+    with pytest.raises(NothingSuitableError):
+        env.reset()

@@ -115,8 +115,8 @@ class Reader:
                 "step, which takes two"
             )
         if self.close and (len(frames) == 1 or not torch.equal(frames[-1], frames[-2])):
-            frames = torch.cat([frames, frames[-1:]])
-        return frames
+            return torch.cat([frames, frames[-1:]])
+        return frames.clone()  # whoever gives episodes one by one may write to their array again
 
 
 def _kind(value: object) -> str:

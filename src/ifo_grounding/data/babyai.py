@@ -46,8 +46,9 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
         level: such as ``GoToObj``, ``GoToLocal`` or ``PickupLoc``, or a full id.
         tile_size: pixels along one side of a cell.
         mission: what becomes of a room whose mission is fulfilled. It ``ends`` and pays, as BabyAI
-            has it; it ``waits`` until the policy is done, and then pays; or there is ``none``, and
-            the room goes on: a learner practises what it chooses itself.
+            has it; it ``waits`` until the policy is done, and then pays, also where the policy has
+            undone the mission since; or there is ``none``, and the room goes on: a learner
+            practises what it chooses itself.
 
     Raises:
         UserError: where minigrid is missing, or there is no such level.

@@ -131,7 +131,9 @@ class FrameCodec:
         codes = Spool()
         seen = 0
         for piece in itertools.chain([first], pieces):
-            codes.append(codec.update(piece))
+            code = codec.update(piece)
+            # Whoever gives pieces one by one may write to their memory again.
+            codes.append(code.clone() if code is piece else code)
             seen += len(piece)
             if seen >= patience and codec._share(seen) > WORTH:
                 codec, codes = codec._give_up(codes)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
 from ifo_grounding import keys
 from ifo_grounding.data.codec import FrameCodec, decode
+from ifo_grounding.errors import UserError
 
 FRAME_KEYS: tuple[NestedKey, ...] = (keys.PIXELS, (keys.NEXT, keys.PIXELS))
 
@@ -57,12 +60,15 @@ class FrameDecoder(Transform):
             in_keys_inv=list(in_keys) if encodes else [],
             out_keys_inv=list(out_keys) if encodes else [],
         )
-        self.codec = codec
-        self.register_buffer("words", codec.words)
+        self.codec, self._code_dtype = codec, codec.code_dtype
+        self.register_buffer("words", codec.words, persistent=encodes)
         self.register_buffer("frames", frames, persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Decode the entries of a sample."""
+        words = self.codec.words
+        if self.words is not None and words is not None and len(words) > len(self.words):
+            self.words = words.to(self.words.device)  # the dictionary grew
         return super().forward(_follow(tensordict, self.words))
 
     def _apply_transform(self, codes: Tensor) -> Tensor:
@@ -72,8 +78,31 @@ class FrameDecoder(Transform):
             return codes
         return decode(self.words, codes.to(self.words.device))
 
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        encoded = super()._inv_call(tensordict)
+        pixels = set(self.out_keys_inv) - set(self.in_keys_inv)
+        return encoded.exclude(*pixels) if pixels else encoded
+
     def _inv_apply_transform(self, pixels: Tensor) -> Tensor:
-        return self.codec.encode(pixels.cpu())
+        codes = self.codec.encode(pixels.cpu())
+        if codes.dtype != self._code_dtype:
+            raise UserError(
+                f"{self.codec} has grown beyond the numbers of type {self._code_dtype} that this "
+                "buffer stores: make a new buffer for it"
+            )
+        return codes
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        """Load a dictionary as a new one, for that of the codec may be in use elsewhere."""
+        words = state_dict.get(f"{prefix}words")
+        if self.frames is None and self.words is not None and words is not None:
+            tiles = words.cpu().clone().view(torch.uint8)
+            self.codec = FrameCodec(self.codec.image_shape, tiles)
+            self._code_dtype = self.codec.code_dtype
+            self.words = torch.empty_like(words, device=self.words.device)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
 class Lookup(Transform):

@@ -37,7 +37,7 @@ class RandomActions(TensorDictModuleBase):
         env: environment with one categorical action.
         stop_probability: probability of ``stop_action``; the others share the rest evenly. By
             default all are equally likely.
-        stop_action: by default that of the environment, or the last action where it does not say.
+        stop_action: by default that of the environment; none where it does not say.
         seed: of the actions.
 
     Raises:
@@ -63,7 +63,8 @@ class RandomActions(TensorDictModuleBase):
         self.in_keys: list[Any] = []
         self.out_keys = [env.action_key]
         self.shape, self.n_actions, self.device = spec.shape, int(spec.space.n), env.device
-        self.stop_action = self._stop(env) if stop_action is None else stop_action
+        named = attribute(env, STOP_ACTION) if stop_action is None else stop_action
+        self.stop_action: int | None = named
         if self.stop_action is not None and not 0 <= self.stop_action < self.n_actions:
             raise UserError(f"stop_action must be 0..{self.n_actions - 1}, got {stop_action}")
         self.probabilities = torch.full((self.n_actions,), 1 / self.n_actions)
@@ -71,13 +72,13 @@ class RandomActions(TensorDictModuleBase):
             if not 0.0 <= stop_probability <= 1.0 or self.n_actions < 2:
                 raise UserError(f"stop_probability must be within 0..1, got {stop_probability}")
             if self.stop_action is None:
-                raise UserError("stop_probability is for worlds with a stop, and this one has none")
+                raise UserError(
+                    "stop_probability is for worlds with a stop, and this one names none: give "
+                    "stop_action="
+                )
             self.probabilities.fill_((1 - stop_probability) / (self.n_actions - 1))
             self.probabilities[self.stop_action] = stop_probability
         self.generator = seeded(seed, "random actions")
-
-    def _stop(self, env: EnvBase) -> int | None:
-        return attribute(env, STOP_ACTION) if says_stop(env) else self.n_actions - 1
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write an action into each row."""
@@ -187,12 +188,16 @@ def collect_transitions(
         n: steps to take, at least; all environments of the batch step together. The buffer holds
             fewer where unchanged ones are dropped.
         stop_probability: probability of the stop; by default all actions are equally likely.
-        stop_action: which action is the stop; by default the environment's ``stop_action``, or the
-            last one where it has no such attribute. Where that is None, none is.
+        stop_action: which action is the stop; by default the environment's ``stop_action``. Where
+            that is None, none is.
         drop_unchanged: whether to leave out unchanged transitions other than stops.
         seed: of the actions; scenes are drawn by the environment.
         progress: whether to show a bar.
         options: for ``TensorDictReplayBuffer``, such as ``batch_size``, ``sampler``, ``generator``.
+
+    Raises:
+        UserError: where nobody says which action is the stop, and unchanged frames are to be left
+            out; where no step showed anything.
 
     Returns:
         The buffer, which stores codes and decodes them when sampled, and counts per action.
@@ -204,6 +209,12 @@ def collect_transitions(
     """
     if n < 1:
         raise UserError(f"n must be at least 1 step, got {n}")
+    if drop_unchanged and stop_action is None and not says_stop(env):
+        raise UserError(
+            "the environment does not say which action is its stop, whose unchanged frames are "
+            f"kept: give stop_action=, set its {STOP_ACTION} (None where no action is), or say "
+            "drop_unchanged=False"
+        )
     policy = RandomActions(env, stop_probability, stop_action, seed)
     harvest = _Harvest(policy.n_actions, policy.stop_action, drop_unchanged)
     batches = _collect(env, policy, n, progress)

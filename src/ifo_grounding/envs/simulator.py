@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.keys import STOP
 from ifo_grounding.tasks.goals import Plan, fulfilled
 from ifo_grounding.tasks.scenes import (
     Scene,
@@ -20,6 +20,25 @@ from ifo_grounding.world import Canvas, WorldState, render, step
 
 MOST_REMEMBERED = 8
 """Steps and resets between two pictures of all worlds, beyond which all cells are looked at."""
+
+
+def check_actions(action: Tensor, worlds: int, count: int) -> None:
+    """Raise :class:`UserError` where actions are not one number below ``count`` for each world.
+
+    On a GPU numbers are not looked at, for that would wait for it.
+    """
+    if action.shape != (worlds,) or action.is_floating_point() or action.dtype == torch.bool:
+        raise UserError(
+            f"actions must be one integer for each of {worlds} worlds, "
+            f"got {action.dtype} of shape {list(action.shape)}"
+        )
+    if action.device.type == "cpu":
+        low, high = (int(bound) for bound in action.aminmax())
+        if low < 0 or high >= count:
+            raise UserError(
+                f"actions are 0..{count - 1} here, got {low}..{high}: was the policy made for "
+                "another world?"
+            )
 
 
 class Simulator:
@@ -158,20 +177,16 @@ class Simulator:
             episode ends, and always false where there are no instructions.
 
         Raises:
-            UserError: where actions have another shape, such as one-hot actions.
+            UserError: where actions have another shape, such as one-hot actions, or are others.
         """
-        if action.shape != self.steps.shape:
-            raise UserError(
-                f"actions must be one integer for each of {self.num_envs} worlds, "
-                f"got shape {list(action.shape)}"
-            )
+        check_actions(action, self.num_envs, keys.N_ACTIONS)
         before = self._running.state
         self._running.state = state = step(before, action)
         if self._touched is not None:
             # Side by side, for pictures are drawn fastest in the order in which they lie.
             self._touch(self._every_row, torch.stack([before.arm, state.arm], dim=-1))
         self.steps = self.steps + 1
-        terminated = action == STOP
+        terminated = action == keys.STOP
         truncated = (self.steps >= self.options.max_steps) & ~terminated
         ended = terminated | truncated
         if not self.options.instructed:

@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs.reading import ADD, ENDED, Read, Reading, whole
+from ifo_grounding.envs.simulator import check_actions
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
@@ -217,13 +218,9 @@ class GymnasiumEnv(EnvBase):
         return torch.arange(first, first + count)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = tensordict.get(keys.ACTION).cpu().numpy()
-        if not 0 <= actions.min() <= actions.max() < self.n_actions:
-            raise UserError(
-                f"actions are 0..{self.n_actions - 1} here, got {actions.min()}..{actions.max()}: "
-                "was the policy made for another world?"
-            )
-        self._seen, reward, *_ = self.worlds.step(actions)
+        actions = tensordict.get(keys.ACTION).cpu()
+        check_actions(actions, self.num_envs, self.n_actions)
+        self._seen, reward, *_ = self.worlds.step(actions.numpy())
         terminated, truncated, stopped = self._seen[ENDED].astype(bool).T
         done = terminated | truncated | stopped
         terminated = terminated | stopped

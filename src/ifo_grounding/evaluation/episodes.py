@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
@@ -88,7 +88,7 @@ def play(
     lengths = torch.zeros(rows, dtype=torch.int64, **on)
     stopped = torch.zeros(rows, dtype=torch.bool, **on)
     active = torch.arange(rows, **on)
-    state = start
+    state, reward_key = start, true_reward_key(env)
     # These are stepped on after an end, which spares new scenes for rows that nobody looks at.
     runs_on = isinstance(env, PickAndPlaceEnv | GymnasiumEnv)
     with set_exploration_type(MODES[mode]):
@@ -99,7 +99,7 @@ def play(
             after = transition[keys.NEXT]
             ended = after["done"].reshape(-1)
             lengths[active] += 1
-            success[active] = ended & (after[env.reward_key].reshape(-1) > 0)
+            success[active] = ended & (after[reward_key].reshape(-1) > 0)
             by_itself = after.get("terminated", after["done"])
             stopped[active] = ended & by_itself.reshape(-1)
             if on_step is not None:
@@ -111,6 +111,22 @@ def play(
             if not runs_on:
                 state = env.maybe_reset(state)
     return Outcomes(success, lengths, stopped)
+
+
+def true_reward_key(env: EnvBase) -> NestedKey:
+    """Return the key of an environment's true reward, which may have learned ones beside it.
+
+    Raises:
+        UserError: where there are several, and none is called ``reward``.
+    """
+    found = env.reward_keys
+    if len(found) == 1:
+        return found[0]
+    if keys.REWARD in found:
+        return keys.REWARD
+    raise UserError(
+        f"the environment pays {found}: success is seen from the true reward, named {keys.REWARD!r}"
+    )
 
 
 def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor) -> Tensor:

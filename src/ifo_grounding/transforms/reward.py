@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import Compose, EnvBase, Transform
 
 from ifo_grounding.attributes import stop_of
 from ifo_grounding.errors import UserError, check_choice
@@ -71,7 +71,8 @@ class LearnedReward(EpisodeTransform):
 
     Raises:
         UserError: on an unknown kind or form, or a judge of another form; where goals are to be
-            paid and nobody says which action is the stop.
+            paid and nobody says which action is the stop; where a later transform changes what a
+            judge reads.
 
     >>> from tensordict.nn import TensorDictModule
     >>> model = TensorDictModule(lambda action: (action * 0.0).unsqueeze(-1), ["action"],
@@ -171,6 +172,7 @@ class LearnedReward(EpisodeTransform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_place()
         if self.judges_goals:
             first = tensordict.get(self.initial_pixels_key)
             next_tensordict.set(self.initial_pixels_key, first)
@@ -181,6 +183,23 @@ class LearnedReward(EpisodeTransform):
                     flag = next_tensordict.get(key)
                     next_tensordict.set(key, flag | arrived.view_as(flag))
         return next_tensordict.set(self.reward_key, reward)
+
+    def _check_place(self) -> None:
+        """Refuse what later transforms have made of entries that the judges read.
+
+        A step is given what they have made of the last observation already.
+        """
+        beside = getattr(self.container, "transform", None)
+        parts = list(beside.transforms) if isinstance(beside, Compose) else []
+        later = parts[parts.index(self) + 1 :] if self in parts else []
+        written = {unravel_key(key) for part in later for key in part.out_keys or []}
+        if not written.isdisjoint(self.in_keys):
+            shown = self.parent.full_observation_spec.keys(True, True)
+            if changed := written & set(self.in_keys) & set(shown):
+                raise UserError(
+                    f"a transform after {type(self).__name__} changes {sorted(map(str, changed))}, "
+                    "which its judge reads: put it before, or let it write to other out_keys"
+                )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabel collected steps, a tensordict [*B], with ``("next", "learned_reward")``.
@@ -314,7 +333,9 @@ def numbers(action: Tensor) -> Tensor:
     >>> numbers(torch.tensor([[0, 0, 1], [1, 0, 0]])).tolist()
     [2, 0]
     """
-    return action.argmax(-1) if action.ndim > 1 and action.shape[-1] > 1 else action
+    if action.ndim == 1 or action.shape[-1] == 1:
+        return action
+    return (action.byte() if action.dtype == torch.bool else action).argmax(-1)
 
 
 def formed(logit: Tensor, form: str) -> Tensor:

@@ -146,6 +146,10 @@ class InstructionSampler(InstructionTransform):
         self._score_sum = 0.0
 
     def _choose(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        if self.scorer.classifier is not self.classifier:  # another one was put there
+            scored = self.scorer.scored
+            self.scorer = PoolScorer(self.classifier, self.scorer.pool, self.in_keys[0])
+            self.scorer.scored = scored
         index, score = choose_instructions(
             self.scorer,
             None,
