@@ -44,6 +44,7 @@ def train(
     history = learn(options, stage, loss, buffer, section, checkpoint, held_out=held_out, log=log)
     if finish is not None:
         finish()
+    stage.replace()
     networks.save(loss.network, stage.run / file)  # type: ignore[arg-type]
     return stage.finish({**history[-1], **found}, history)
 

@@ -4,18 +4,21 @@ from collections.abc import Sequence
 from typing import Any
 
 from _learning import fit_config, self_examination_config
-from _shared import RUNNING, plain
+from _shared import RUNNING, changed_networks, made_with, plain
 from _worlds import Grid, open_world
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.evaluation.episodes import MODES
-from ifo_grounding.files import read_json
+from ifo_grounding.networks import NetworkConfig
+from ifo_grounding.networks.config import KINDS as NETWORKS
+from ifo_grounding.objectives.instruction import UNLABELLED
 from ifo_grounding.seeding import STREAMS
 from ifo_grounding.tasks import SPLITS
 from ifo_grounding.training import Run
 from ifo_grounding.transforms.choosing import check_options
+from ifo_grounding.transforms.reward import FORMS, KINDS
 
 LEARNED = ("inverse", "imitate", "instruction", "reward", "goal")
 """Sections that say how a network learns."""
@@ -51,12 +54,13 @@ def check(options: DictConfig) -> None:
     check_choice("evaluate.mode", section.mode, [*MODES, "both"])
     check_choice("evaluate.stream", section.stream, STREAMS)
     check_choice("evaluate.split", section.split, SPLITS)
-    if section.states < 0:
-        raise UserError(f"evaluate.states must not be negative, got {section.states}")
-    if (share := options.transitions.stop_probability) is not None and not 0 <= share <= 1:
-        raise UserError(f"transitions.stop_probability must be within 0..1, got {share}")
     chosen = options.instruction
     check_options(chosen.threshold, chosen.candidates, chosen.choose)
+    check_choice("instruction.unlabelled", chosen.unlabelled, UNLABELLED)
+    check_choice("self_examine.kind", options.self_examine.kind, KINDS)
+    check_choice("self_examine.form", options.self_examine.form, FORMS)
+    for kind in NETWORKS:
+        NetworkConfig.of(kind, options.network, **changed_networks(options))
 
 
 def as_made(options: DictConfig) -> DictConfig:
@@ -68,8 +72,8 @@ def as_made(options: DictConfig) -> DictConfig:
         UserError: where the command names what contradicts how the run was made.
     """
     named = [name.lstrip("+~").split("=")[0] for name in HydraConfig.get().overrides.task]
-    path = Run(options.run) / "options.json"
-    return merged(options, read_json(path), named) if path.exists() else options
+    made = made_with(Run(options.run))
+    return merged(options, made, named) if made else options
 
 
 def merged(options: DictConfig, made: dict[str, Any], named: Sequence[str]) -> DictConfig:

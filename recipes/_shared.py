@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from _values import check_values
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
@@ -17,6 +18,7 @@ from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
 from ifo_grounding.data.pictures import LIST, read_list
 from ifo_grounding.errors import UserError
+from ifo_grounding.files import read_json, write_json
 from ifo_grounding.report import format_cell, text_table
 from ifo_grounding.training.run import Run, Stage
 
@@ -33,21 +35,23 @@ REFERENCE = "reference-true-actions.safetensors"
 CLASSIFIER = "instruction.safetensors"
 REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
+OF_LOOKS = ("evaluate", "evaluate_references")
+"""Stages that look at what a run has made."""
+PLACE = ("task", "simulator")
+"""Options that all stages of a run share."""
 RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
 """Options that decide no result."""
-AT_LEAST_ONE = (
-    "threads",
-    "demonstrations.n",
-    "transitions.n",
-    "transitions.num_envs",
-    "self_examine.num_envs",
-    "evaluate.episodes",
-    "evaluate.audit_episodes",
-    "imitate.trials",
-    "imitate.trial_steps",
-    "instruction.trials",
-    "instruction.trial_steps",
+MADE = "options.json"
+"""Options that a run was made with."""
+PHASE_2 = (
+    "self_examine",
+    "continue_imitation",
+    "clone_accepted",
+    "evaluate",
+    POLICIES[1],
+    *CONTROLS,
 )
+"""Stages and networks that a run makes anew where it takes over another's phase 1."""
 
 
 def fewer(number: int, than: int, value: Any, otherwise: Any) -> Any:
@@ -65,41 +69,39 @@ OmegaConf.register_new_resolver("fewer", fewer, replace=True)
 def open_run(options: DictConfig) -> Run:
     """Return the run of these options, with torch's threads and memory set.
 
-    Where fewer demonstrations were recorded elsewhere than asked for, the options ask for those.
+    A new one takes over what its ``base`` has made, but for phase 2. Where fewer demonstrations
+    were recorded elsewhere than asked for, the options ask for those.
     """
-    for name in AT_LEAST_ONE:
-        if (number := OmegaConf.select(options, name)) is not None and number < 1:
-            raise UserError(f"{name} must be at least 1, got {number}")
-    if (halvings := options.imitate.get("trial_halvings", 0)) < 0:
-        raise UserError(f"imitate.trial_halvings must not be negative, got {halvings}")
-    if (share := options.imitate.held_out) >= 1 or share < 0:
-        raise UserError(
-            f"imitate.held_out is a share of the demonstrations, in [0, 1), got {share}"
-        )
-    try:
-        device = torch.device(options.device)
-    except RuntimeError:
-        raise UserError(f"device={options.device} is none: use cpu, cuda or cuda:0") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"device={options.device}: torch sees no GPU here; use device=cpu")
+    check_values(options)
     if options.recorded and (number := recorded(options.recorded)) < options.demonstrations.n:
         options.demonstrations.n = number  # presets ask for it
     keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:
         torch.set_num_threads(options.threads)
-    return Run(options.run, options.logger)
+    run = Run(options.run, options.logger)
+    if options.base:
+        run.take_over(Run(options.base), without=PHASE_2)
+    return run
 
 
 def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:
-    """Return a stage that is decided by options or sections of them, the seed and the world."""
+    """Return a stage that is decided by options or sections of them, the seed and the world.
+
+    Raises:
+        UserError: where the stages that it needs are of another task or world.
+    """
     release_freed_memory()  # of the stage before
     run = open_run(options)
+    if needs:
+        check_place(run, options)
     common = ["task", "seed", "network", "world"]
     decisive = {key: plain(OmegaConf.select(options, key)) for key in [*common, *sections]}
     if changed := changed_networks(options):
         decisive["networks"] = changed  # only then: runs without any go on as they were
     stage = run.stage(name, decisive, needs)
+    if stage.result is None and name not in OF_LOOKS:
+        keep_options(run, options, [*PLACE, *common, "networks", *sections])
     if stage.result is not None:
         doing = "done before"
     elif run.record(name):
@@ -108,6 +110,42 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
         doing = "running"
     print(f"{name}: {doing}", flush=True)
     return stage
+
+
+def keep_options(run: Run, options: DictConfig, names: Sequence[str]) -> None:
+    """Keep with a run with which options it was made: ``names`` are those of its latest stage."""
+    path = run / MADE
+    made = made_with(run) if path.exists() else plain(options)
+    for name in names:
+        section, _, part = name.partition(".")
+        value = plain(OmegaConf.select(options, name))
+        (made[section] if part else made)[part or section] = value
+    write_json(path, made)
+
+
+def made_with(run: Run) -> dict[str, Any]:
+    """Return the options that a run was made with, as far as it says.
+
+    Raises:
+        UserError: where its file says something else.
+    """
+    path = run / MADE
+    made = read_json(path) if path.exists() else {}
+    if not isinstance(made, dict) or (path.exists() and not made.get("evaluate")):
+        raise UserError(f"{path} is damaged: remove it, and say what the run was made with")
+    return made
+
+
+def check_place(run: Run, options: DictConfig) -> None:
+    """Raise :class:`UserError` where a run is of another task or in another world."""
+    made = made_with(run)
+    for name in PLACE:
+        there, here = made.get(name), plain(options[name])
+        if made and there != here:
+            raise UserError(
+                f"the run {options.run} was made with {name}={there}, not {here}: say so, or name "
+                "another run"
+            )
 
 
 @functools.cache

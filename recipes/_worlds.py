@@ -154,6 +154,8 @@ WORLDS: dict[str, type[World]] = {"grid": Grid, "babyai": BabyAI}
 def open_world(options: DictConfig) -> World:
     """Return the world of these options."""
     check_choice("simulator", options.simulator, WORLDS)
+    if options.simulator == "babyai" and "layout" in options.world:  # settings of the grid
+        raise UserError("a level of BabyAI is chosen by world=babyai level=...")
     return WORLDS[options.simulator](options)
 
 

@@ -22,6 +22,7 @@ def collect(options: DictConfig) -> dict:
         seed=options.seed,
         progress=shows_progress(options),
     )
+    stage.replace()
     collected.save(stage.run / RANDOM_STEPS)
     counts = {name: getattr(collected.report, name).tolist() for name in ("taken", "kept")}
     return stage.finish(counts)

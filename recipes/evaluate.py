@@ -3,7 +3,6 @@
 import sys
 from typing import Any
 
-import torch
 from _options import OF_EVALUATION, as_made
 from _results import keep_result, write_result
 from _shared import (
@@ -76,7 +75,7 @@ def evaluate(options: DictConfig) -> dict:
         )
     policies = {name: load_network(run, NAMES[name], "imitate", options) for name in current}
     world = open_world(options)
-    results |= evaluate_policies(policies, run, world)
+    results |= evaluate_policies(policies, world)
     if world.oracle:
         results |= evaluate_endings(policies, world)
         if options.evaluate.states and run.is_current("train_instruction"):
@@ -85,12 +84,10 @@ def evaluate(options: DictConfig) -> dict:
     return stage.finish(results)
 
 
-def evaluate_policies(policies: dict[str, Any], run: Run, world: World) -> dict[str, Any]:
+def evaluate_policies(policies: dict[str, Any], world: World) -> dict[str, Any]:
     """Measure success of each policy on the same fixed scenes, and the gain of phase 2."""
     measured = measured_success(policies, world)
     results = success_results(measured)
-    phases = [measured[name].outcomes for name in PHASES if name in measured]
-    torch.save(torch.stack(phases), run / "outcomes.pt")
     if "phase2" in measured:
         results["gain"] = compare_success(measured["phase1"], measured["phase2"]).as_dict()
     return results
@@ -161,8 +158,7 @@ def evaluate_judges(policy: Any, run: Run, world: World) -> dict[str, Any]:
     if run.is_current("train_reward"):
         judge = load_network(run, REWARD, "train_reward", options)
         if world.oracle:
-            others = {name: value for name, value in audited.items() if name != "seed"}
-            demos, truth = world.demonstrate(HELD_OUT, **others)
+            demos, truth = world.demonstrate(HELD_OUT, **audited)
             results["action_reward"] = reward_audit(judge, demos, truth).as_dict()
         audit = return_correlation(policy, judge, place, average=True, **shown)
         results["action_return"] = audit.as_dict()

@@ -12,6 +12,7 @@ from torchrl.data import ReplayBuffer
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import Demonstrations, labelled_buffer
+from ifo_grounding.errors import UserError
 from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.training import Run, Stage
@@ -76,9 +77,23 @@ def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, Repla
 def split_transitions(
     demos: Demonstrations, actions: Tensor, share: float
 ) -> tuple[ReplayBuffer, ReplayBuffer | None]:
-    """Return transitions with their actions to learn from, and those of the share held out."""
+    """Return transitions with their actions to learn from, and those of the share held out.
+
+    Raises:
+        UserError: where nothing is left to learn from or held out, or actions are of others.
+    """
     seen = demos[: len(demos) - round(share * len(demos))]
     aside = demos[len(seen) :]
+    if not len(seen) or bool(share) != bool(len(aside)):
+        raise UserError(
+            f"imitate.held_out={share} of {len(demos)} demonstrations holds out {len(aside)}: some "
+            "have to be held out, and some left to learn from"
+        )
+    if len(actions) != demos.transitions:
+        raise UserError(
+            f"there are {len(actions)} actions for {demos.transitions} transitions: run the recipe "
+            "that labels the demonstrations again"
+        )
     split = seen.transitions
     held_out = labelled_buffer(aside, actions[split:]) if len(aside) else None
     return labelled_buffer(seen, actions[:split]), held_out

@@ -28,6 +28,7 @@ def label(options: DictConfig) -> dict:
     demos = load_demonstrations(stage.run)
     inverse = load_network(stage.run, INVERSE, "train_inverse", options)
     _, report = label_demonstrations(demos, inverse, progress=shows_progress(options))
+    stage.replace()
     report.save(stage.run / LABELS)
     found: dict[str, Any] = {"confidence": report.summary()}
     # Only the evaluation reads the truth: nothing of it goes back into training.

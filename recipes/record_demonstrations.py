@@ -16,12 +16,14 @@ def record(options: DictConfig) -> dict:
         return stage.result
     if options.recorded:
         demos = read_recorded(options)
+        stage.replace()
         demos.save(stage.run / DEMONSTRATIONS)
         shutil.rmtree(stage.run / TRUTH, ignore_errors=True)  # of others, recorded before
     else:
         demos, truth = open_world(options).demonstrate(
             options.demonstrations.n, seed=options.seed, progress=shows_progress(options)
         )
+        stage.replace()
         demos.save(stage.run / DEMONSTRATIONS)
         truth.save(stage.run / TRUTH)
     counts = {"demonstrations": len(demos), "transitions": demos.transitions}

@@ -34,7 +34,7 @@ from ifo_grounding.report import (
     training_curves,
     write_report,
 )
-from ifo_grounding.report.results import restored
+from ifo_grounding.report.results import restored, unpacked
 from ifo_grounding.training import Run
 
 CURVES = {
@@ -105,7 +105,7 @@ def episode_pictures(run: Run, world: World, results: dict[str, Any]) -> dict[st
     found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES, **drawn)
     if len(policies) == 1:
         return found | step_by_step(policies[0], list(range(TRACED)), run, world)
-    before, after = torch.load(run / "outcomes.pt", weights_only=True)
+    before, after = (torch.from_numpy(unpacked([{"results": results}], p)[0]) for p in PHASES)
     improved = (after & ~before).nonzero().squeeze(-1)[:TRACED].tolist()
     for title, changed in {
         "Solved by phase 2 alone": after & ~before,

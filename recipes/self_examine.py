@@ -63,6 +63,7 @@ def examine(options: DictConfig) -> dict:
         progress=shows_progress(options),
         settings=stage.settings,
     )
+    stage.replace()
     networks.save(policy, run / POLICIES[1])
     return stage.finish(history[-1], history)
 

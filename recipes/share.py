@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from _options import as_made
 from _shared import (
     CLASSIFIER,
     GOAL,
@@ -77,7 +78,7 @@ def card_facts(run: Run, options: DictConfig) -> dict[str, object]:
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    for folder in share(options):
+    for folder in share(as_made(options)):
         print(folder)
 
 

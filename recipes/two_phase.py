@@ -2,7 +2,7 @@
 
 from _options import check
 from _results import write_result
-from _shared import CONTROLS, POLICIES, open_run, plain
+from _shared import MADE, open_run, plain
 from collect_transitions import collect
 from evaluate import evaluate
 from imitate import imitate
@@ -18,18 +18,7 @@ from train_reward import train_reward
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.files import write_json
 from ifo_grounding.report import results_table
-from ifo_grounding.training import Run
 from report import report
-
-PHASE_2 = (
-    "self_examine",
-    "continue_imitation",
-    "clone_accepted",
-    "evaluate",
-    POLICIES[1],
-    *CONTROLS,
-)
-"""Stages and networks that a run makes anew where it takes over another's phase 1."""
 
 
 def two_phase(options: DictConfig) -> dict:
@@ -42,9 +31,7 @@ def two_phase(options: DictConfig) -> dict:
 def train_phases(options: DictConfig) -> None:
     run = open_run(options)
     check(options)
-    if options.base:
-        run.take_over(Run(options.base), without=PHASE_2)
-    write_json(run / "options.json", plain(options))
+    write_json(run / MADE, plain(options))
     # Phase 1: imitation from observation.
     record(options)  # first, for they hold the words of worlds with a vocabulary of their own
     collect(options)

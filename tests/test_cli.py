@@ -112,6 +112,8 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
         (["preset=huge"], "unknown preset 'huge': choose one of paper, strong"),
         (["task=a,b"], "option 'task' got several values: add --multirun to run each"),
         (["+nested.rat=1"], "unknown option 'nested.rat' (did you mean 'rate'?)"),
+        (["+nestd.rate=1"], "unknown option 'nestd.rate' (did you mean 'nested'?)"),
+        (["+stepz=1"], "unknown option 'stepz' (did you mean 'steps'?)"),
         (["task"], "cannot read 'task': options are written name=value"),
         (["task=[a"], "cannot read 'task=[a': options are written name=value"),
         (["--tsk"], "unknown flag '--tsk': options are written name=value; see --help"),
@@ -133,7 +135,7 @@ def test_a_mistake_gets_one_line_and_code_2(recipes, capsys, arguments, said):
 
 @pytest.mark.parametrize(
     "argument",
-    ["name=mine", "limit=5", "folder=here", "+new=1", "~flag", "sizes=[3]", "nested.rate=2"],
+    ["name=mine", "limit=5", "folder=here", "+limit=1", "~flag", "sizes=[3]", "nested.rate=2"],
 )
 def test_what_options_offer_is_accepted(recipes, capsys, argument):
     assert run("run", "greet", argument) == 0

@@ -300,3 +300,32 @@ def test_reliability_of_a_calibrated_and_of_an_overconfident_forecast():
             reliability(*wrong)
     with pytest.raises(UserError, match="bins"):
         reliability([0.5], [1], bins=0)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.02])
+def test_a_gain_over_seeds_that_share_no_luck_of_scenes_is_found_as_by_a_t_test(spread):
+    rng = np.random.default_rng(1)
+    found, expected = [], []
+    for _ in range(40):
+        before = rng.random((5, 1000)) < 0.9
+        after = rng.random((5, 1000)) < 0.91 + rng.normal(0, spread, (5, 1))
+        found.append(paired_difference(before, after, resamples=10).p_value)
+        change = (after * 1.0 - before).mean(1)
+        expected.append(scipy_stats.ttest_1samp(change, 0).pvalue)
+    assert np.median(found) == pytest.approx(np.median(expected), rel=0.25)
+
+
+def test_the_luck_of_shared_scenes_passes_for_a_gain_no_more_often_than_it_says():
+    rng = np.random.default_rng(0)
+    found = alone = 0
+    for _ in range(300):
+        luck = rng.choice([-0.3, 0.3], 200)  # of a scene, whatever the seed
+        before = rng.random((5, 200)) < 0.5
+        after = rng.random((5, 200)) < 0.5 + luck
+        found += paired_difference(before, after, resamples=10).p_value < 0.05
+        alone += scipy_stats.ttest_1samp((after * 1.0 - before).mean(1), 0).pvalue < 0.05
+    assert found <= 24 < alone  # 5% would be 15
+
+
+def test_one_scene_of_several_seeds_has_a_p_value():
+    assert 0 < paired_difference([[0], [0], [1]], [[1], [0], [1]]).p_value <= 1

@@ -241,23 +241,42 @@ def _check_value(defaults: DictConfig, override: Override, choices: list[str]) -
 
 
 def _check_added(key: str) -> None:
-    """Refuse to add to a section what no options and no part of the library have a name for."""
+    """Refuse to add what no options and no part of the library have a name for."""
     section, _, name = key.partition(".")
-    if not name or "." in name:
+    if "." in name:
         return
+    known = _sections()
+    names = known.get(section, set())
+    if section not in known:
+        hint = did_you_mean(section, sorted(known))
+    elif name and name not in names:
+        hint = did_you_mean(name, sorted(names))
+    else:
+        return
+    raise UserError(f"unknown option {key!r}{hint}: nothing would read it")
+
+
+def _sections() -> dict[str, set[str]]:
+    """Return what options of all recipes, and the library where it reads a section, have names for.
+
+    By section; other options are sections of nothing.
+    """
     from omegaconf import OmegaConf
 
     from ifo_grounding.networks import NetworkConfig
     from ifo_grounding.training import FitConfig, SelfExaminationConfig
 
-    kinds = (NetworkConfig, FitConfig, SelfExaminationConfig)
-    known = {each.name for kind in kinds for each in fields(kind)}
+    known: dict[str, set[str]] = {}
     for file in (recipes_folder() / "conf").rglob("*.yaml"):
-        options = OmegaConf.select(OmegaConf.load(file), section)
-        known |= set(map(str, options)) if OmegaConf.is_dict(options) else set()
-    if name not in known:
-        hint = did_you_mean(name, sorted(known))
-        raise UserError(f"unknown option {key!r}{hint}: nothing would read it")
+        parts = OmegaConf.to_container(OmegaConf.load(file))
+        for section, options in parts.items() if isinstance(parts, dict) else ():
+            names = known.setdefault(str(section), set())
+            names |= set(map(str, options)) if isinstance(options, dict) else set()
+    read = {"networks": NetworkConfig, "self_examine": SelfExaminationConfig}
+    for section, names in known.items():
+        kind = read.get(section, FitConfig if "batch_size" in names else None)
+        names |= {each.name for each in fields(kind)} if kind else set()
+    return known
 
 
 def _fits(given: Any, kind: type) -> bool:

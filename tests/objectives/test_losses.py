@@ -317,6 +317,19 @@ def test_adversarial_reward_loss_by_hand():
     assert out["loss_reward"].item() == pytest.approx((positives + negatives) / 2, rel=1e-5)
     assert float(out["positive_probability"]) == pytest.approx(0.55)
     assert float(out["negative_probability"]) == pytest.approx(0.8)
+    for reduction in ("none", "sum"):
+        loss = RewardLoss(network, n_actions=2, reduction=reduction)
+        with pytest.raises(UserError, match=r"as many .* got \[1\] and \[2\]"):
+            loss.adversarial(demonstrations, policy)
+        assert loss.adversarial(demonstrations, demonstrations)["loss_reward"].numel()
+
+
+@pytest.mark.parametrize("action", [-1, 6])
+def test_other_actions_than_the_networks_are_refused(action):
+    for kind in ("reward", "imitation", "inverse"):
+        data = batch().set("action", torch.full((12,), action))
+        with pytest.raises(UserError, match=f"action {action} is none of the network's 0..5"):
+            make_loss(kind)(data)
 
 
 def test_adversarial_training_pushes_the_policys_actions_down():
@@ -443,3 +456,14 @@ def test_few_suitable_pairs_are_not_removed():
     assert negatives.removal_rate == 0
     negatives.watch(torch.ones(1000), torch.cat([torch.ones(800), -torch.ones(200)]))
     assert negatives.removal_rate == pytest.approx(840 / 2000, abs=0.02)
+
+
+def test_the_share_of_suitable_pairs_comes_from_random_ones_alone():
+    states = torch.zeros(3, 3, 24, 24, dtype=torch.uint8)
+    loss = make_loss("instruction", negatives=3, near=0.5, states=states, fresh=2)
+    seen = []
+    loss.negatives.estimate.add = lambda own, other: seen.append(other.shape[-1])
+    loss.negatives.estimate.ratio = 100
+    loss(batch())
+    assert loss.count == 3 and loss.negatives.uniform(3) == 2
+    assert seen == [4]  # two of the three others, and itself in two states

@@ -1,9 +1,20 @@
 """What is refused before a run begins, and with which options a finished run is looked at."""
 
 import pytest
+import torch
 
 from ifo_grounding.cli import run_recipe
+from ifo_grounding.data import record_demonstrations
 from ifo_grounding.errors import UserError
+from ifo_grounding.files import read_json
+
+STAGES_OF_PHASE_1 = (
+    "record_demonstrations",
+    "collect_transitions",
+    "train_inverse",
+    "label",
+    "imitate",
+)
 
 
 @pytest.mark.parametrize(
@@ -92,3 +103,74 @@ def test_scenes_of_pairs_that_were_named_are_no_zero_shot(compose, capsys):
     train_phases(compose("two_phase", "demonstrations.n=100", "phase2=false"))
     evaluate(compose("evaluate", "evaluate.split=zero-shot", "demonstrations.n=100"))
     assert "no zero-shot success" in capsys.readouterr().err
+
+
+def test_a_run_made_stage_by_stage_is_looked_at_as_it_was_made(compose, tmp_path, capsys):
+    from evaluate import evaluate
+    from imitate import imitate
+    from record_demonstrations import record
+
+    pick = ["task=pick", "demonstrations.n=90"]
+    for stage in STAGES_OF_PHASE_1:
+        steps = ["imitate.steps=30"] if stage == "imitate" else []
+        run_recipe(stage, [*pick, *steps, "budget=tiny", f"run={tmp_path / 'run'}"])
+    looked_at = [f"run={tmp_path / 'run'}"]
+    run_recipe("evaluate", [*looked_at, "evaluate.episodes=20"])
+    written = read_json(tmp_path / "run" / "options.json")
+    assert (written["task"], written["demonstrations"]["n"]) == ("pick", 90)
+    assert written["imitate"]["steps"] == 30
+    run_recipe("share", [*looked_at, f"to={tmp_path / 'shared'}"])
+    card = (tmp_path / "shared" / "policy" / "README.md").read_text()
+    assert "pick" in card and "90" in card
+    for stage in (imitate, evaluate):
+        with pytest.raises(UserError, match="was made with task=pick, not move"):
+            stage(compose("imitate", "demonstrations.n=90"))
+    record(compose("record_demonstrations"))  # the first stage of another run in its place
+    assert read_json(tmp_path / "run" / "options.json")["task"] == "move"
+
+
+def test_damaged_options_are_said_to_be(compose, tmp_path):
+    from _shared import made_with, open_run
+
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "options.json").write_text("3")
+    with pytest.raises(UserError, match=r"options\.json is damaged"):
+        made_with(open_run(compose()))
+
+
+@pytest.mark.parametrize("share", [0.999, 0.001])
+def test_some_demonstrations_are_held_out_and_some_are_not(recipes, share):
+    from imitate import split_transitions
+
+    demos = record_demonstrations("move", 30, seed=0)
+    actions = torch.zeros(demos.transitions, dtype=torch.int64)
+    with pytest.raises(UserError, match=f"held_out={share} of 30 demonstrations holds out"):
+        split_transitions(demos, actions, share)
+    with pytest.raises(UserError, match=r"actions for .* transitions"):
+        split_transitions(demos, actions[1:], 0.5)
+
+
+def test_any_stage_of_a_new_run_may_begin_with_what_another_made(compose, tmp_path):
+    from label import label
+    from two_phase import train_phases
+
+    train_phases(compose("two_phase", "phase2=false"))
+    base = f"base={tmp_path / 'run'}"
+    assert label(compose("label", base, f"run={tmp_path / 'other'}"))["confidence"]
+    with pytest.raises(UserError, match="holds no finished stages"):
+        label(compose("label", f"base={tmp_path / 'none'}", f"run={tmp_path / 'third'}"))
+
+
+@pytest.mark.parametrize(
+    ("added", "said"),
+    [
+        ("+imitat.schedule=constant", "unknown option 'imitat.schedule' (did you mean 'imitate'?)"),
+        ("+imitate.iterations=5", "unknown option 'imitate.iterations'"),
+        ("+self_examine.hidden=5", "unknown option 'self_examine.hidden'"),
+        ("+imitate.grad_clip=-1.0", "grad_clip must be above 0"),
+    ],
+)
+def test_what_nothing_would_read_is_not_added(recipes, capsys, added, said):
+    with pytest.raises(SystemExit) as stopped:
+        run_recipe("two_phase", ["budget=tiny", added])
+    assert stopped.value.code == 2 and said in capsys.readouterr().err

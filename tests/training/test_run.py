@@ -132,3 +132,10 @@ def test_a_name_with_a_folder_is_a_path(tmp_path, monkeypatch):
     assert Run(".").folder.resolve() == tmp_path
     with pytest.raises(UserError, match="needs a name"):
         Run("")
+
+
+def test_what_is_being_replaced_is_not_taken_for_done(tmp_path):
+    run = Run(tmp_path / "run")
+    run.stage("count", {"to": 3}).finish({"counted": 3})
+    run.stage("count", {"to": 4}).replace()  # and killed before it was done
+    assert run.stage("count", {"to": 3}).result is None and not run.is_current("count")

@@ -122,7 +122,18 @@ def test_the_schedule_warms_up_and_ends_near_zero():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"steps": 0}, {"batch_size": -1}, {"schedule": "linear"}, {"prior": -1}]
+    "wrong",
+    [
+        {"steps": 0},
+        {"batch_size": -1},
+        {"schedule": "linear"},
+        {"prior": -1},
+        {"grad_clip": 0},
+        {"grad_clip": -1.0},
+        {"warmup": 5.0},
+        {"warmup": -0.1},
+        {"evaluate_every": -2},
+    ],
 )
 def test_impossible_configs_are_refused(wrong):
     with pytest.raises(UserError):

@@ -122,8 +122,11 @@ def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = 
             f"actions must have shape {list(expected)}, got {list(action.shape)}: indices have no "
             "trailing dim, and one-hot actions fit a one-hot policy alone"
         )
-    if count is not None and action.device.type == "cpu" and int(action.max()) >= count:
-        raise UserError(
-            f"action {int(action.max())} is none of the network's 0..{count - 1}: make the network "
-            "for the environment whose actions these are"
-        )
+    if count is None or action.device.type != "cpu" or not action.numel():
+        return
+    for number in map(int, action.aminmax()):
+        if not 0 <= number < count:
+            raise UserError(
+                f"action {number} is none of the network's 0..{count - 1}: make the network for "
+                "the environment whose actions these are"
+            )

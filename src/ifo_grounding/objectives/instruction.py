@@ -167,7 +167,9 @@ class InstructionLoss(SupervisedLoss):
             if self.states is not None:
                 other = torch.cat([other, self._elsewhere(batch)], 1)
         if self.training:
-            self.negatives.watch(own, other)
+            near = slice(self.negatives.uniform(self.count), self.count)
+            random = torch.cat([other[:, : near.start], other[:, near.stop :]], 1)
+            self.negatives.watch(own, random)
         if self.unlabelled == "removal":
             kept = self.negatives.keep(other)
             refused = masked_mean(F.softplus(other), kept)

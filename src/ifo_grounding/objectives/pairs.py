@@ -117,7 +117,7 @@ class NegativeInstructions(nn.Module):
         return self.pool[nearest.gather(1, chosen)]
 
     def watch(self, own: Tensor, other: Tensor) -> None:
-        """Learn the share of suitable ones from scores of positives [N] and negatives [*, K].
+        """Learn the share of suitable ones from scores of positives [N] and random others [*, K].
 
         Of the negatives no more are remembered than reach back as far as the positives: scores grow
         while a classifier learns, and later ones of one kind would pass for better ones.
@@ -125,7 +125,7 @@ class NegativeInstructions(nn.Module):
         if self.estimate is not None:
             count = other.shape[-1]
             as_far = self.estimate.ratio * own.numel() * count // max(other.numel(), 1)
-            self.estimate.add(own, other[..., : min(self.uniform(count), max(as_far, 1))])
+            self.estimate.add(own, other[..., : max(as_far, 1)])
             self.heed()
 
     def heed(self) -> None:

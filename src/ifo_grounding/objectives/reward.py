@@ -85,11 +85,21 @@ class RewardLoss(SupervisedLoss):
 
         Args:
             demonstrations: transitions with labelled actions, as for :meth:`forward`.
-            policy: transitions with the policy's actions, of any batch size.
+            policy: transitions with the policy's actions, of any batch size; as many as of
+                demonstrations, unless the loss is a mean.
             smoothing: how far the targets are from 1 and 0, for the policy is often right.
+
+        Raises:
+            UserError: where the loss is no mean, and the two are not of one size.
         """
         self._require(demonstrations)
         self._require(policy)
+        if self.reduction != "mean" and policy.batch_size != demonstrations.batch_size:
+            raise UserError(
+                f"reduction={self.reduction!r} needs as many transitions of the policy as of "
+                f"demonstrations, got {list(policy.batch_size)} and "
+                f"{list(demonstrations.batch_size)}"
+            )
         with self._mode():
             right = self._scores(demonstrations, self._actions(demonstrations)).squeeze(-1)
             wrong = self._scores(policy, self._actions(policy)).squeeze(-1)
@@ -130,7 +140,9 @@ class RewardLoss(SupervisedLoss):
     def _scores(self, tensordict: TensorDictBase, actions: Tensor) -> Tensor:
         """Score several actions [*B, K] of each state: logits [*B, K]."""
         *input_keys, action_key = self.network.in_keys
-        check_action(actions[..., 0], tuple(tensordict.get(input_keys[-1]).shape[:-1]))
+        check_action(
+            actions[..., 0], tuple(tensordict.get(input_keys[-1]).shape[:-1]), self.n_actions
+        )
         if hasattr(self.network, "all_actions"):
             every = self.network.all_actions(*(tensordict.get(key) for key in input_keys))
             return every.gather(-1, actions)

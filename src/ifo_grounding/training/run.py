@@ -90,9 +90,7 @@ class Run:
         if not (other.folder / "stages").is_dir():
             raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
         anew = [*without, *(f"{name}.json" for name in without)]
-        passing = shutil.ignore_patterns(
-            "logs", "checkpoints", "result.json", "options.json", *anew
-        )
+        passing = shutil.ignore_patterns("logs", "checkpoints", "result.json", *anew)
         copy = self.folder.with_name(f"{self.folder.name}.copying")
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(other.folder, copy, ignore=passing)
@@ -148,6 +146,10 @@ class Stage:
         folder, stem = self.checkpoint.parent, self.checkpoint.stem
         return [self.checkpoint, *sorted(folder.glob(f"{stem}-*.pt"))]
 
+    def replace(self) -> None:
+        """Forget that the stage is done: what was made with other settings is written over now."""
+        self.run._record_path(self.name).unlink(missing_ok=True)
+
     def finish(
         self, result: dict[str, Any], history: Sequence[Metrics] | None = None
     ) -> dict[str, Any]:
@@ -166,8 +168,8 @@ class Stage:
     def log(self) -> Log | None:
         """Return a function that sends metrics to the run's TorchRL logger.
 
-        After a kill, steps that are logged already are not logged again: a continued run repeats
-        them exactly.
+        A continued run repeats the steps since its checkpoint exactly. In ``csv`` files those that
+        are logged already are not logged again; other loggers get them twice.
         """
         if self.run.logger == "none":
             return None

@@ -74,11 +74,14 @@ class FitConfig:
         for name in ("steps", "batch_size", "iteration", "validate_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.lr <= 0:
-            raise UserError(f"lr must be above 0, got {self.lr}")
-        for name in ("weight_decay", "prior"):
-            if getattr(self, name) < 0:
+        for name in ("lr", "grad_clip"):
+            if not getattr(self, name) > 0:
+                raise UserError(f"{name} must be above 0, got {getattr(self, name)}")
+        for name in ("weight_decay", "prior", "evaluate_every"):
+            if not getattr(self, name) >= 0:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        if not 0 <= self.warmup <= 1:
+            raise UserError(f"warmup is a share of the steps, within 0..1, got {self.warmup}")
         if self.schedule not in ("constant", "cosine"):
             raise UserError(f"unknown schedule {self.schedule!r}: choose constant or cosine")
 

@@ -31,12 +31,12 @@ class Layout:
         """Refuse layouts that no grid can hold."""
         if not 3 <= self.size <= 16:
             raise UserError(f"size must be 3..16 cells, got {self.size}")
-        for name, (low, high), most in (
+        for name, counts, most in (
             ("objects", self.objects, self.size**2),
             ("boxes", self.boxes, N_BOXES),
         ):
-            if not 0 <= low <= high <= most:
-                raise UserError(f"{name} must be (fewest, most) within 0..{most}, got {low, high}")
+            if len(counts) != 2 or not 0 <= counts[0] <= counts[1] <= most:
+                raise UserError(f"{name} must be (fewest, most) within 0..{most}, got {counts}")
         if self.objects[1] + self.boxes[1] > self.size**2:
             raise UserError(
                 f"{self.objects[1]} objects and {self.boxes[1]} boxes do not fit on "
