@@ -140,8 +140,9 @@ def check_place(run: Run, options: DictConfig) -> None:
     """Raise :class:`UserError` where a run is of another task or in another world."""
     made = made_with(run)
     for name in PLACE:
-        there, here = made.get(name), plain(options[name])
-        if made and there != here:
+        here = plain(options[name])
+        there = made.get(name, here)  # older runs have no name for their world
+        if there != here:
             raise UserError(
                 f"the run {options.run} was made with {name}={there}, not {here}: say so, or name "
                 "another run"
