@@ -161,7 +161,8 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
             :func:`~ifo_grounding.envs.from_gymnasium`.
         stream: name of the stream.
         tile_size: pixels along one side of a cell.
-        processes: how many record side by side.
+        processes: how many record side by side; with several, a script needs its
+            ``if __name__ == "__main__":``.
         vocabulary: the words of the missions; by default those that occur.
         progress: whether to show a bar.
 

@@ -69,7 +69,8 @@ def from_gymnasium(
             a policy does ends an episode as far as a learner is told.
         skip_unknown: whether words that the vocabulary does not hold are left out of instructions;
             otherwise they are refused.
-        processes: whether every world runs in a process of its own.
+        processes: whether every world runs in a process of its own, for which a script needs its
+            ``if __name__ == "__main__":``, as all that begin processes do.
         seed: of the stream of scenes; random by default.
         stream: ``training``, ``validation`` or ``evaluation``: disjoint scenes.
         device: where tensors go.
