@@ -458,12 +458,13 @@ def test_few_suitable_pairs_are_not_removed():
     assert negatives.removal_rate == pytest.approx(840 / 2000, abs=0.02)
 
 
-def test_the_share_of_suitable_pairs_comes_from_random_ones_alone():
-    states = torch.zeros(3, 3, 24, 24, dtype=torch.uint8)
+@pytest.mark.parametrize("fresh", [0, 2])
+def test_the_share_of_suitable_pairs_comes_from_random_ones_alone(fresh):
+    states = torch.zeros(3, 3, 24, 24, dtype=torch.uint8) if fresh else None
     loss = make_loss("instruction", negatives=3, near=0.5, states=states, fresh=2)
     seen = []
     loss.negatives.estimate.add = lambda own, other: seen.append(other.shape[-1])
     loss.negatives.estimate.ratio = 100
     loss(batch())
     assert loss.count == 3 and loss.negatives.uniform(3) == 2
-    assert seen == [4]  # two of the three others, and itself in two states
+    assert seen == [2 + fresh]  # two of the three others, and itself in fresh states

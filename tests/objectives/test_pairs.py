@@ -66,15 +66,6 @@ def test_near_negatives_differ_in_few_words(monkeypatch):
     assert negatives.uniform(10) == 5
 
 
-def test_the_share_is_estimated_from_uniform_negatives_alone():
-    negatives = NegativeInstructions(POOL, "estimated", near=0.5)
-    likely = torch.full((4000,), 5.0)
-    other = torch.full((4000, 4), -5.0)
-    other[:, 2:] = 5.0  # the near ones
-    negatives.watch(likely, other)
-    assert negatives.removal_rate == 0.0
-
-
 def test_nothing_scored_nothing_dropped():
     assert NegativeInstructions(POOL, 0.3).keep(torch.zeros(0)).shape == (0,)
 

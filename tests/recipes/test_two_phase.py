@@ -370,7 +370,7 @@ def test_practice_on_stale_judges_is_refused_and_said_to_be_left_out(compose, tm
         ("imitate.trial_halvings=-1", "trial_halvings must be 0 or more"),
         ("imitate.trials=0", "imitate.trials must be at least 1"),
         ("instruction.trial_steps=0", "instruction.trial_steps must be at least 1"),
-        ("imitate.held_out=2", r"a share of the demonstrations, in \[0, 1\)"),
+        ("imitate.held_out=2", r"imitate.held_out must be a share, in \[0, 1\)"),
         ("self_examine.select_episodes=0", "select_episodes must be at least 1"),
         ("threads=-1", "threads must be at least 1"),
         ("device=meta", "device=meta is none: use cpu, cuda or cuda:0"),
