@@ -333,7 +333,7 @@ def numbers(action: Tensor) -> Tensor:
     >>> numbers(torch.tensor([[0, 0, 1], [1, 0, 0]])).tolist()
     [2, 0]
     """
-    if action.ndim == 1 or action.shape[-1] == 1:
+    if action.ndim < 2 or action.shape[-1] == 1:
         return action
     return (action.byte() if action.dtype == torch.bool else action).argmax(-1)
 
