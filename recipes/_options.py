@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from _learning import fit_config, self_examination_config
-from _shared import RUNNING, changed_networks, made_with, plain
+from _shared import RUNNING, changed_networks, check_same, made_with, plain
+from _values import check_values
 from _worlds import Grid, open_world
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -42,6 +43,7 @@ def check(options: DictConfig) -> None:
     Raises:
         UserError: on a value that its stage would refuse.
     """
+    check_values(options)
     world = open_world(options)
     if options.recorded and options.references:
         raise UserError("recorded demonstrations hold no actions: leave references=true out")
@@ -89,14 +91,6 @@ def merged(options: DictConfig, made: dict[str, Any], named: Sequence[str]) -> D
             result.evaluate = here["evaluate"]
         elif not name.startswith("hydra"):
             for decided in GROUPS.get(name, [name]):
-                _check_same(result, options, decided)
+                there = plain(OmegaConf.select(result, decided))
+                check_same(options, decided, there, f"leave {decided} out")
     return result
-
-
-def _check_same(result: DictConfig, options: DictConfig, name: str) -> None:
-    here, there = (plain(OmegaConf.select(each, name)) for each in (options, result))
-    if here != there:
-        raise UserError(
-            f"the run {options.run} was made with {name}={there}, not {here}: leave {name} out, or "
-            "name another run"
-        )

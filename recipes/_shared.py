@@ -94,14 +94,16 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
     release_freed_memory()  # of the stage before
     run = open_run(options)
     if needs:
-        check_place(run, options)
+        made = made_with(run)
+        for place in filter(made.__contains__, PLACE):  # older runs do not name their world
+            check_same(options, place, made[place], "say so")
     common = ["task", "seed", "network", "world"]
     decisive = {key: plain(OmegaConf.select(options, key)) for key in [*common, *sections]}
     if changed := changed_networks(options):
         decisive["networks"] = changed  # only then: runs without any go on as they were
     stage = run.stage(name, decisive, needs)
     if stage.result is None and name not in OF_LOOKS:
-        keep_options(run, options, [*PLACE, *common, "networks", *sections])
+        keep_options(run, options, ["simulator", *common, "networks", *sections])
     if stage.result is not None:
         doing = "done before"
     elif run.record(name):
@@ -114,39 +116,33 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
 
 def keep_options(run: Run, options: DictConfig, names: Sequence[str]) -> None:
     """Keep with a run with which options it was made: ``names`` are those of its latest stage."""
-    path = run / MADE
-    made = made_with(run) if path.exists() else plain(options)
-    for name in names:
-        section, _, part = name.partition(".")
-        value = plain(OmegaConf.select(options, name))
-        (made[section] if part else made)[part or section] = value
-    write_json(path, made)
+    made = made_with(run) or plain(options)
+    write_json(run / MADE, {**made, **{name: plain(options[name]) for name in names}})
 
 
 def made_with(run: Run) -> dict[str, Any]:
-    """Return the options that a run was made with, as far as it says.
+    """Return the options that a run was made with, empty where it does not say.
 
     Raises:
         UserError: where its file says something else.
     """
     path = run / MADE
-    made = read_json(path) if path.exists() else {}
-    if not isinstance(made, dict) or (path.exists() and not made.get("evaluate")):
+    if not path.exists():
+        return {}
+    made = read_json(path)
+    if not isinstance(made, dict) or not made.get("evaluate"):
         raise UserError(f"{path} is damaged: remove it, and say what the run was made with")
     return made
 
 
-def check_place(run: Run, options: DictConfig) -> None:
-    """Raise :class:`UserError` where a run is of another task or in another world."""
-    made = made_with(run)
-    for name in PLACE:
-        here = plain(options[name])
-        there = made.get(name, here)  # older runs have no name for their world
-        if there != here:
-            raise UserError(
-                f"the run {options.run} was made with {name}={there}, not {here}: say so, or name "
-                "another run"
-            )
+def check_same(options: DictConfig, name: str, there: Any, mend: str) -> None:
+    """Raise :class:`UserError` where a run was made with another value of an option."""
+    here = plain(OmegaConf.select(options, name))
+    if here != there:
+        raise UserError(
+            f"the run {options.run} was made with {name}={there}, not {here}: {mend}, or name "
+            "another run"
+        )
 
 
 @functools.cache

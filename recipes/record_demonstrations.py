@@ -15,16 +15,16 @@ def record(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     if options.recorded:
-        demos = read_recorded(options)
-        stage.replace()
-        demos.save(stage.run / DEMONSTRATIONS)
-        shutil.rmtree(stage.run / TRUTH, ignore_errors=True)  # of others, recorded before
+        demos, truth = read_recorded(options), None
     else:
         demos, truth = open_world(options).demonstrate(
             options.demonstrations.n, seed=options.seed, progress=shows_progress(options)
         )
-        stage.replace()
-        demos.save(stage.run / DEMONSTRATIONS)
+    stage.replace()
+    demos.save(stage.run / DEMONSTRATIONS)
+    if truth is None:
+        shutil.rmtree(stage.run / TRUTH, ignore_errors=True)  # of others, recorded before
+    else:
         truth.save(stage.run / TRUTH)
     counts = {"demonstrations": len(demos), "transitions": demos.transitions}
     return stage.finish({**counts, "instructions": len(demos.pool())})

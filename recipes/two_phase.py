@@ -29,8 +29,8 @@ def two_phase(options: DictConfig) -> dict:
 
 
 def train_phases(options: DictConfig) -> None:
+    check(options)  # first, for a new run takes over what its base has made
     run = open_run(options)
-    check(options)
     write_json(run / MADE, plain(options))
     # Phase 1: imitation from observation.
     record(options)  # first, for they hold the words of worlds with a vocabulary of their own

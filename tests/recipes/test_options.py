@@ -157,6 +157,10 @@ def test_any_stage_of_a_new_run_may_begin_with_what_another_made(compose, tmp_pa
     train_phases(compose("two_phase", "phase2=false"))
     base = f"base={tmp_path / 'run'}"
     assert label(compose("label", base, f"run={tmp_path / 'other'}"))["confidence"]
+    refused = compose("two_phase", base, f"run={tmp_path / 'second'}", "self_examine.kind=foo")
+    with pytest.raises(UserError, match=r"unknown self_examine\.kind"):
+        train_phases(refused)
+    assert not (tmp_path / "second").exists()
     with pytest.raises(UserError, match="holds no finished stages"):
         label(compose("label", f"base={tmp_path / 'none'}", f"run={tmp_path / 'third'}"))
 
