@@ -95,6 +95,14 @@ def test_scenes_are_written_to_rows_of_others():
     assert same(others, expected)
 
 
+def test_scenes_of_several_blocks_come_in_the_order_of_their_numbers():
+    stream = SceneStream(SceneOptions("move"), seed=0)
+    block = streams.BLOCK
+    numbers = torch.tensor([2 * block, 5, block + 3, 2 * block + 1, 5, 7])
+    one_by_one = torch.cat([stream.scenes(number.view(1)) for number in numbers])
+    assert same(stream.scenes(numbers), one_by_one)
+
+
 def test_scenes_stay_what_they_are():
     """Results name the scenes that they are about: a change here makes all of them of others."""
     digest = hashlib.sha256()

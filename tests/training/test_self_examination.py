@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.objectives.value import GAE
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -153,6 +154,24 @@ def test_values_of_some_worlds_at_a_time_are_those_of_all_at_once(monkeypatch):
     for some in learned[:2]:
         for one, whole in zip(some, learned[2], strict=True):
             torch.testing.assert_close(one, whole, atol=1e-4, rtol=1e-3)
+
+
+def test_advantages_are_those_of_torchrls_estimator_with_its_own_values():
+    """Episodes end, are cut off after three steps, and go on beyond the batch."""
+    policy, value = make_networks()
+    worlds = simulator(64, max_steps=3)
+    sampler = InstructionSampler(accepts_all(), POOL)
+    env = TransformedEnv(worlds, Compose(sampler, LearnedReward(likes(1))))
+    learner = policy_gradient.Learner(env, policy, value, config(gamma=0.9))
+    batch = learner.collect()
+    assert batch["next", "terminated"].any() and batch["next", "truncated"].any()
+    assert not batch["next", "done"][:, -1].all()
+    expected = GAE(gamma=0.9, lmbda=0.95, value_network=value, deactivate_vmap=True)
+    expected.set_keys(reward=keys.LEARNED_REWARD)
+    expected(asked := batch.clone())
+    learner._estimate_advantages(batch)
+    for name in ("advantage", "value_target", "state_value"):
+        torch.testing.assert_close(batch[name], asked[name], atol=1e-5, rtol=1e-4)
 
 
 def test_without_discount_it_learns_what_torchrls_estimator_would_teach_it():

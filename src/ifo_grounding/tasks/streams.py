@@ -61,9 +61,12 @@ class SceneStream:
 
     def scenes(self, numbers: Tensor) -> Scene:
         """Return the scenes with the given numbers, int64 [N]."""
-        blocks, rows = self._find(numbers)
-        drawn = [self._block(block)[0] for block in blocks]
-        return (drawn[0] if len(drawn) == 1 else _cat(drawn))[rows]
+        parts = self._find(numbers)
+        found = [self._block(block)[0][rows] for block, rows, _ in parts]
+        if len(found) == 1:
+            return found[0]
+        order = torch.cat([places for _, _, places in parts])
+        return _cat(found)[order.argsort()]
 
     def write(self, numbers: Tensor, leaves: list[Tensor], rows: Tensor) -> None:
         """Write the scenes with the given numbers, int64 [N], to rows of others, int64 [N].
@@ -75,23 +78,28 @@ class SceneStream:
             leaves: what the others are made of, in the order of :func:`scene_leaves`.
             rows: where, each once.
         """
-        blocks, found = self._find(numbers)
-        drawn = [self._block(block)[1] for block in blocks]
-        for leaf, *parts in zip(leaves, *drawn, strict=True):
-            source = parts[0] if len(parts) == 1 else torch.cat(parts)
-            leaf.index_copy_(0, rows, source.index_select(0, found))
+        parts = self._find(numbers)
+        for block, found, places in parts:
+            there = rows if len(parts) == 1 else rows[places]
+            for leaf, source in zip(leaves, self._block(block)[1], strict=True):
+                leaf.index_copy_(0, there, source.index_select(0, found))
 
-    def _find(self, numbers: Tensor) -> tuple[list[int], Tensor]:
-        """Return the blocks that hold given scenes, and the scenes' rows in all of these."""
+    def _find(self, numbers: Tensor) -> list[tuple[int, Tensor, Tensor]]:
+        """Return the blocks that hold given scenes, their rows there, and their places here."""
         if not numbers.numel():
-            return [0], numbers
+            return [(0, numbers, numbers)]
         low, high = (int(end) for end in numbers.aminmax())
         if low < 0:
             raise UserError("scene numbers start at 0")
+        everywhere = torch.arange(len(numbers), device=numbers.device)
         if (first := low // BLOCK) == high // BLOCK:
-            return [first], numbers - first * BLOCK
-        blocks, place = (numbers // BLOCK).unique(return_inverse=True)
-        return blocks.tolist(), place * BLOCK + numbers % BLOCK
+            return [(first, numbers - first * BLOCK, everywhere)]
+        blocks, which = (numbers // BLOCK).unique(return_inverse=True)
+        parts = []
+        for each, block in enumerate(blocks.tolist()):
+            places = (which == each).nonzero().squeeze(-1)
+            parts.append((block, numbers[places] - block * BLOCK, places))
+        return parts
 
     def _draw(self, block: int) -> tuple[Scene, list[Tensor]]:
         """Return the scenes of a block, and what they are made of."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -42,9 +42,8 @@ class Learner:
         self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl else None
         self.collector = make_collector(env, policy, config.steps)
         self.batches: Iterator[TensorDictBase] | None = None
-        self.advantage = GAE(
-            gamma=config.gamma, lmbda=config.lmbda, value_network=value, deactivate_vmap=True
-        )
+        # Values are given: the estimator would look at nearly all states twice, as next ones too.
+        self.advantage = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=None)
         self.advantage.set_keys(reward=keys.LEARNED_REWARD)
         self.loss = _make_loss(policy, value, config)
         critic = {id(p) for p in value.parameters()}
@@ -99,22 +98,30 @@ class Learner:
 
     @torch.no_grad()
     def _estimate_advantages(self, batch: TensorDictBase) -> None:
-        """Write advantages and value targets of steps [N, T], some worlds at a time."""
-        parts = batch.split(max(1, AT_ONCE // batch.shape[-1]))
-        estimate = self.advantage if self.config.gamma else self._undiscounted
-        found = self.advantage.out_keys
-        batch.update(torch.cat([estimate(part).select(*found) for part in parts]))
+        """Write advantages and value targets of steps [*B, T]."""
+        names, seen = self.advantage.tensor_keys, self.value.in_keys
+        value = self._values(batch.select(*seen).reshape(-1)).view(*batch.shape, 1)
+        if not self.config.gamma:  # what comes next would count nothing
+            reward = batch[keys.NEXT, keys.LEARNED_REWARD]
+            found = {names.advantage: reward - value, names.value_target: reward}
+            batch.update({**found, names.value: value})
+            return
+        # The next state is the next step's own, but where an episode or the batch is cut off; where
+        # one ends, it counts nothing.
+        upcoming = batch[keys.NEXT]
+        cut = upcoming["done"].clone()
+        cut[..., -1, :] = True
+        cut &= ~upcoming["terminated"]
+        following = value.roll(-1, -2)
+        if cut.any():
+            following[cut] = self._values(upcoming.select(*seen)[cut.squeeze(-1)]).view(-1)
+        batch[names.value], batch[keys.NEXT, names.value] = value, following
+        self.advantage(batch)
 
-    def _undiscounted(self, part: TensorDictBase) -> TensorDictBase:
-        """Do what the estimator does where only a step's own reward counts, for half the price.
-
-        It would estimate the value of the next state all the same, and multiply it by 0.
-        """
-        names = self.advantage.tensor_keys
-        value = self.value(part.select(*self.value.in_keys))[names.value]
-        reward = part[keys.NEXT, keys.LEARNED_REWARD]
-        found = {names.advantage: reward - value, names.value_target: reward, names.value: value}
-        return TensorDict(found, part.batch_size)
+    def _values(self, states: TensorDictBase) -> Tensor:
+        """Return the values of states [M], some at a time."""
+        name = self.advantage.tensor_keys.value
+        return torch.cat([self.value(part)[name] for part in states.split(AT_ONCE)])
 
     def close(self) -> None:
         """Let go of the collector, and leave the env open for its owner."""
