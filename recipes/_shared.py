@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _values import check_values
+from _values import check_values, count_held_out
 from omegaconf import DictConfig, OmegaConf
 from torchrl import torchrl_logger
 
@@ -75,6 +75,7 @@ def open_run(options: DictConfig) -> Run:
     check_values(options)
     if options.recorded and (number := recorded(options.recorded)) < options.demonstrations.n:
         options.demonstrations.n = number  # presets ask for it
+    count_held_out(options.imitate.held_out, options.demonstrations.n)
     keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:

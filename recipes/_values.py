@@ -70,6 +70,21 @@ def check_values(options: DictConfig) -> None:
     check_device(options.device)
 
 
+def count_held_out(share: float, demonstrations: int) -> int:
+    """Return how many demonstrations a share of them holds out.
+
+    Raises:
+        UserError: where a share above 0 holds out none of them, or all.
+    """
+    number = round(share * demonstrations)
+    if share and not 0 < number < demonstrations:
+        raise UserError(
+            f"imitate.held_out={share} of {demonstrations} demonstrations holds out {number}: some "
+            "have to be held out, and some left to learn from"
+        )
+    return number
+
+
 def check_device(name: str) -> None:
     """Raise :class:`UserError` unless networks can be on a device of this name here."""
     try:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 from _learning import Beginning, beginning_seed
 from _shared import POLICIES, load_demonstrations, load_labels, open_stage, tell
+from _values import count_held_out
 from _worlds import build, context_of
 from omegaconf import DictConfig
 from torch import Tensor
@@ -82,13 +83,8 @@ def split_transitions(
     Raises:
         UserError: where nothing is left to learn from or held out, or actions are of others.
     """
-    seen = demos[: len(demos) - round(share * len(demos))]
+    seen = demos[: len(demos) - count_held_out(share, len(demos))]
     aside = demos[len(seen) :]
-    if not len(seen) or bool(share) != bool(len(aside)):
-        raise UserError(
-            f"imitate.held_out={share} of {len(demos)} demonstrations holds out {len(aside)}: some "
-            "have to be held out, and some left to learn from"
-        )
     if len(actions) != demos.transitions:
         raise UserError(
             f"there are {len(actions)} actions for {demos.transitions} transitions: run the recipe "

@@ -139,7 +139,8 @@ def test_damaged_options_are_said_to_be(compose, tmp_path):
 
 
 @pytest.mark.parametrize("share", [0.999, 0.001])
-def test_some_demonstrations_are_held_out_and_some_are_not(recipes, share):
+def test_some_demonstrations_are_held_out_and_some_are_not(compose, tmp_path, share):
+    from _shared import open_run
     from imitate import split_transitions
 
     demos = record_demonstrations("move", 30, seed=0)
@@ -148,6 +149,10 @@ def test_some_demonstrations_are_held_out_and_some_are_not(recipes, share):
         split_transitions(demos, actions, share)
     with pytest.raises(UserError, match=r"actions for .* transitions"):
         split_transitions(demos, actions[1:], 0.5)
+    options = compose("imitate", "demonstrations.n=30", f"imitate.held_out={share}")
+    with pytest.raises(UserError, match=f"held_out={share} of 30 demonstrations holds out"):
+        open_run(options)
+    assert not (tmp_path / "run").exists()
 
 
 def test_any_stage_of_a_new_run_may_begin_with_what_another_made(compose, tmp_path):
