@@ -157,7 +157,9 @@ def success_rows(
             for phase in also:
                 if some := found.get((task, preset, phase)):
                     row = {"task": "", "by": named(preset, phase), "seeds": str(len(some))}
-                    rows.append({**row, heads[0]: "as above", heads[1]: success(some, "phase2")})
+                    same = len(some) == len(runs[0] or [])
+                    before = "as above" if same else success(some, "phase1")
+                    rows.append({**row, heads[0]: before, heads[1]: success(some, "phase2")})
     return rows
 
 
@@ -354,9 +356,10 @@ def readme_tables() -> str:
             rows[-1][f"`{preset}`, 1"] = success(first, "phase1")
             rows[-1][f"`{preset}`, 2"] = success(practised, "phase2")
             if preset == "paper":
-                rows[-1][f"2, {PAID_FOR_GOALS}"] = success(
-                    found.get((task, preset, GOAL)), "phase2"
-                )
+                paid = found.get((task, preset, GOAL))
+                rows[-1][f"2, {PAID_FOR_GOALS}"] = success(paid, "phase2")
+                seeds = [str(len(some or [])) for some in (first, practised, paid)]
+                rows[-1]["seeds"] = " / ".join(seeds)
             chosen = [run["results"]["suitability"]["rate"]["rate"] for run in first or []]
             suitable[-1][f"`{preset}`"] = mean(chosen, 1) + mark(first) if first else NOT_RUN
     return noted(table(rows), "Suitable instructions among those chosen:", table(suitable))
