@@ -62,6 +62,9 @@ def test_rate_reads_as_a_person_writes_it():
     assert str(wilson(9999, 10_000)) == "99.99% [99.94, 100.00] (n=10000)"
     assert str(wilson(99_999, 100_000)).startswith("99.999% [")
     assert str(wilson(10, 10)).startswith("100.0% [")
+    # Nor is what is not known of one that never came.
+    assert str(wilson(20_000, 20_000)) == "100.00% [99.98, 100.00] (n=20000)"
+    assert str(wilson(0, 100_000)) == "0.000% [0.000, 0.004] (n=100000)"
     assert Rate(0.5, 0.4, 0.6, 5, 10).as_dict() == {
         "rate": 0.5,
         "low": 0.4,
@@ -189,6 +192,33 @@ def test_one_scene_that_changed_does_not_narrow_the_interval():
     assert lost.low < none.low and 0 < lost.high < none.high
     seeds = paired_difference(np.stack([before, before]), np.stack([after, before]))
     assert lost.low < seeds.low < none.low
+
+
+def test_one_scene_that_stayed_as_it_was_does_not_narrow_the_interval():
+    """The mirror image: nearly every scene was won, or lost."""
+    before, after = np.zeros(50, bool), np.ones(50, bool)
+    least = 1 - scipy_stats.binomtest(0, 50).proportion_ci().high
+    won, lost = paired_difference(before, after), paired_difference(after, before)
+    assert (won.low, won.high) == (pytest.approx(100 * least), 100)
+    assert (lost.low, lost.high) == (-100, pytest.approx(-100 * least))
+    after[0] = False
+    share = scipy_stats.binomtest(49, 50).proportion_ci()
+    won = paired_difference(before, after)
+    assert (won.low, won.high) == (pytest.approx(100 * share.low), 100)
+    lost = paired_difference(after, before)
+    assert (lost.low, lost.high) == (-won.high, -won.low)
+    seeds = paired_difference(np.zeros((2, 3)), np.ones((2, 3)))
+    assert seeds.low < 50 and seeds.p_value == 0.25  # as of three scenes
+
+
+def test_intervals_cover_the_truth_where_nearly_all_changes():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(100):
+        after = rng.random(100) < 0.99
+        found = paired_difference(np.zeros(100), after, resamples=500)
+        covered += found.low <= 99 <= found.high
+    assert covered >= 93
 
 
 def test_paired_difference_over_seeds_needs_agreement_of_seeds():

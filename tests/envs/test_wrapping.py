@@ -102,6 +102,13 @@ def test_partial_resets_touch_only_their_rows():
     assert torch.equal(again["next", "pixels"], after["pixels"])  # pressing moves nothing
 
 
+@pytest.mark.parametrize("scene", [-1, 0.5])
+def test_what_is_no_number_of_a_scene_is_refused(scene):
+    env = dials(2)
+    with pytest.raises(UserError, match="scene"):
+        env.reset(TensorDict({"scene": torch.tensor([[0], [scene]])}, [2]))
+
+
 def test_rollouts_go_on_after_episodes_end():
     rollout = dials(3).rollout(40, break_when_any_done=False)
     assert rollout["next", "terminated"].any()

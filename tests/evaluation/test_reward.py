@@ -85,6 +85,17 @@ def test_truth_of_other_demonstrations_is_refused(recorded):
         reward_audit(judge_of_actions(lambda action: action), demos[:5], truth)
 
 
+def test_actions_without_a_name_are_refused(recorded):
+    demos, truth = recorded
+    judge = judge_of_actions(lambda action: action)
+    with pytest.raises(UserError, match="of 3 with a name"):
+        reward_audit(judge, demos, truth, names="LRS")
+    with pytest.raises(UserError, match="judges 6 actions, not 7"):
+        reward_audit(make_reward_model(demos, "film", seed=0), demos, truth, names="URDLPSX")
+    with pytest.raises(UserError, match="at least 1"):
+        reward_audit(judge, demos, truth, transitions=0)
+
+
 def half_expert(make_expert):
     """Solve even scenes; stop at once in odd ones."""
     expert = make_expert("move")

@@ -276,6 +276,22 @@ def test_actions_of_another_shape_are_refused():
         success_rate(wait, one_hot, episodes=2)
 
 
+def test_values_and_logits_are_no_actions():
+    speaks = lambda td: td.set("action", torch.full(td.shape, 5.9))  # noqa: E731
+    for world in ("move", Patient()):
+        with pytest.raises(UserError, match=r"actions are torch\.float32"):
+            success_rate(speaks, world, episodes=2)
+
+
+def test_no_steps_and_no_image_are_refused():
+    wait = lambda td: td.set("action", torch.zeros(td.shape, dtype=torch.int64))  # noqa: E731
+    with pytest.raises(UserError, match="max_steps must be at least 1"):
+        success_rate(wait, Patient(), episodes=2, max_steps=0)
+    renamed = TransformedEnv(Patient(), RenameTransform(["pixels"], ["camera"]))
+    with pytest.raises(UserError, match="its image under 'pixels'"):
+        success_rate(wait, renamed, episodes=2)
+
+
 def test_success_is_seen_from_the_true_reward_where_there_are_others():
     def up(td):
         return td.set("action", torch.zeros(td.shape, dtype=torch.int64))

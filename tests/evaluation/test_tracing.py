@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.networks import make_goal_judge, make_policy, make_reward_model
 from ifo_grounding.report import trace_animation
@@ -71,3 +72,5 @@ def test_every_step_is_a_picture(env):
     for shown in (2, 30):
         moving = Image.open(io.BytesIO(trace_animation(trace, steps=shown)))
         assert moving.n_frames == min(shown, len(episode.actions))
+    with pytest.raises(UserError, match="6 actions and 3 names"):
+        trace_animation(trace, actions="LRS")

@@ -51,6 +51,14 @@ def near(pixel, colour):
     return np.abs(pixel - wanted).max() < 12
 
 
+def test_actions_have_a_name_or_a_number():
+    shown = episode([(0, 0, 0)] * 3, success=True)
+    shown.actions[:] = 6
+    assert animation([shown])  # more than the grid has
+    with pytest.raises(UserError, match="7 actions and 3 names"):
+        animation([shown], actions="LRS")
+
+
 def test_frames_outcomes_and_waiting():
     short = episode([(255, 0, 0), (0, 0, 255)], success=True)
     long = episode([(0, 255, 0)] * 3 + [(255, 255, 0)], success=False)

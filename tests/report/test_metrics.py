@@ -37,6 +37,14 @@ def test_json_lines_cut_short_by_a_kill(tmp_path):
         read_metrics(path)
 
 
+def test_csv_cut_short_by_a_kill(tmp_path):
+    """The rest of a number is a number too."""
+    (tmp_path / "loss.csv").write_text("100,2.0\n200,1.25\n3,0")
+    assert read_metrics(tmp_path)["loss"] == ([100, 200], [2.0, 1.25])
+    (tmp_path / "metrics.csv").write_text("step,loss\n10,0.5\n20,0.")
+    assert read_metrics(tmp_path / "metrics.csv") == {"loss": ([10], [0.5])}
+
+
 def test_csv_with_a_header_and_gaps(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_text("step,loss,success\n0,1.5,\n10,nan,0.5\n20,1.0,0.75\n")
@@ -57,6 +65,14 @@ def test_refusals(tmp_path):
         read_metrics(tmp_path / "nothing.csv")
     with pytest.raises(UserError, match="holds no metrics"):
         read_metrics(tmp_path)
+    for content, said in (
+        (b"", "holds no metrics"),
+        (b'{"loss": 1}\n3\n', "line 2 is no JSON object"),
+        (b"\xff\xfe\x00\n", "is no text"),
+    ):
+        (tmp_path / "metrics.jsonl").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            read_metrics(tmp_path / "metrics.jsonl")
     (tmp_path / "metrics.txt").write_text("loss")
     with pytest.raises(UserError, match=r"neither \.jsonl nor \.csv"):
         read_metrics(tmp_path / "metrics.txt")

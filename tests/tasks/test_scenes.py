@@ -205,3 +205,5 @@ def test_bad_requests_are_refused(monkeypatch):
     monkeypatch.setattr(module, "PATIENCE", 3)
     with pytest.raises(UserError, match="only 0 scenes admit a suitable goal of 'pick'"):
         SceneStream(SceneOptions("pick", layout=Layout(boxes=(0, 0))), 0).scenes(torch.tensor([0]))
+    with pytest.raises(UserError, match="a layout is a Layout"):
+        SceneOptions("pick", layout={"size": 8})

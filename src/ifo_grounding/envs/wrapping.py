@@ -123,6 +123,15 @@ def world_seed(seed: int, stream: str, number: int) -> int:
     return derive(seed, stream, number) % 2**31
 
 
+def _scene_numbers(numbers: Tensor) -> Tensor:
+    """Return numbers of scenes [N] as int64, or refuse what are none."""
+    if numbers.is_floating_point() or numbers.dtype == torch.bool:
+        raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
+    if len(numbers) and int(numbers.min()) < 0:
+        raise UserError("scene numbers start at 0")
+    return numbers.long()
+
+
 class GymnasiumEnv(EnvBase):
     """What :func:`from_gymnasium` returns.
 
@@ -204,7 +213,11 @@ class GymnasiumEnv(EnvBase):
         rows = begins.nonzero().squeeze(-1)
         if len(rows):
             asked = None if tensordict is None else tensordict.get(keys.SCENE, None)
-            numbers = self._next(len(rows)) if asked is None else asked.reshape(-1).cpu()[rows]
+            numbers = (
+                self._next(len(rows))
+                if asked is None
+                else _scene_numbers(asked.reshape(-1).cpu()[rows])
+            )
             self._numbers[rows] = numbers
             seeds: list[int | None] = [None] * self.num_envs
             for row in rows.tolist():

@@ -143,6 +143,11 @@ def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor
             f"environment takes {list(wanted)}: make it with categorical_action_encoding=True if "
             "it is one-hot, or a policy for it"
         )
+    if chosen.is_floating_point() and not action.is_floating_point():
+        raise UserError(
+            f"the policy's actions are {chosen.dtype}, the environment's are numbers of actions: "
+            "make the policy write which action it takes, not values or logits"
+        )
     action[active] = chosen.to(action)
     return action.reshape(every.shape)
 
@@ -150,6 +155,8 @@ def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor
 def most_steps(env_or_task: EnvBase | str, max_steps: int | None) -> int:
     """Return the most actions of an episode: as said, or those of a task or of an environment."""
     if max_steps is not None:
+        if max_steps < 1:
+            raise UserError(f"max_steps must be at least 1, got {max_steps}")
         return max_steps
     return MAX_STEPS if isinstance(env_or_task, str) else MAX_STEPS_OF_OTHERS
 
@@ -283,11 +290,17 @@ def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
             f"options {sorted(env_options)} are for an environment made from a task's name: "
             "give them to your environment"
         )
-    if keys.INSTRUCTION not in env.observation_spec.keys(True, True):
+    shown = env.observation_spec.keys(True, True)
+    if keys.INSTRUCTION not in shown:
         raise UserError(
             "success needs an environment that shows its instruction under "
             f"{keys.INSTRUCTION!r}: make it with instructed=True, or rename its entry with "
             "torchrl.envs.RenameTransform"
+        )
+    if keys.PIXELS not in shown:
+        raise UserError(
+            f"success needs an environment that shows its image under {keys.PIXELS!r}: rename its "
+            "entry with torchrl.envs.RenameTransform"
         )
 
 

@@ -25,6 +25,7 @@ from ifo_grounding.evaluation.episodes import (
 )
 from ifo_grounding.evaluation.labels import actions_of
 from ifo_grounding.modules import evaluating
+from ifo_grounding.networks.trunk import Network
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.stats import Estimate, Rate, auc, correlation, wilson
 from ifo_grounding.transforms import LearnedReward
@@ -62,7 +63,7 @@ def reward_audit(
     transitions: int = 5000,
     seed: int = 0,
     batch_size: int = 1024,
-    names: Sequence[str] = keys.ACTIONS,
+    names: Sequence[str] | None = None,
 ) -> RewardAudit:
     """Score every action in transitions of held-out demonstrations, and compare with the expert's.
 
@@ -78,12 +79,22 @@ def reward_audit(
         transitions: how many to draw, without repetition.
         seed: of the draw.
         batch_size: pairs scored together.
-        names: of the actions.
+        names: of the actions; by default the grid's, or numbers where the model judges more or
+            fewer.
 
     Raises:
-        UserError: where truth does not have one action per transition.
+        UserError: where truth does not have one action per transition, or there is not one name for
+            each action that the model judges, or nothing to draw.
     """
+    if transitions < 1:
+        raise UserError(f"transitions must be at least 1, got {transitions}")
+    names = _names_for(reward_model, names)
     actions = actions_of(truth)
+    if len(actions) and int(actions.max()) >= len(names):
+        raise UserError(
+            f"truth has the action {int(actions.max())}, of {len(names)} with a name: give names= "
+            "of all actions"
+        )
     if len(actions) != demos.transitions or not len(actions):
         raise UserError(
             f"truth has {len(actions)} actions and the demonstrations {demos.transitions} "
@@ -104,6 +115,17 @@ def reward_audit(
         },
         first=wilson(int((scores[taken] > others).sum()), len(drawn)),
     )
+
+
+def _names_for(model: TensorDictModuleBase, names: Sequence[str] | None) -> Sequence[str]:
+    """Return a name for each action that a judge knows, as far as it says how many that are."""
+    networks = (each for each in model.modules() if isinstance(each, Network))
+    known = next((each.shapes.n_actions for each in networks), len(names or keys.ACTIONS))
+    if names is None:
+        return keys.ACTIONS if known == len(keys.ACTIONS) else [*map(str, range(known))]
+    if len(names) != known:
+        raise UserError(f"the model judges {known} actions, not {len(names)}: name each of them")
+    return names
 
 
 def _area(scores: Tensor, taken: Tensor, group: Tensor) -> Estimate:

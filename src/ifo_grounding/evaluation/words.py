@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation.episodes import device_of
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import GroundedTrunk
 from ifo_grounding.networks.transfer import trunk_of
@@ -52,14 +53,15 @@ def word_evidence(
     trunk = trunk_of(policy)
     if not isinstance(trunk, GroundedTrunk):
         raise UserError("this policy does not read word by word: build it with preset 'strong'")
-    state = WorldState.empty(1)
-    state.objects[0, :N_KINDS] = torch.arange(1, N_KINDS + 1, dtype=torch.uint8)
+    device = device_of(policy)
+    state = WorldState.empty(1, device=device)
+    state.objects[0, :N_KINDS] = torch.arange(1, N_KINDS + 1, dtype=torch.uint8, device=device)
     state.arm[0] = N_KINDS
-    tokens = VOCABULARY.encode(list(words))[:, 0]
+    tokens = VOCABULARY.encode(list(words))[:, 0].to(device)
     with evaluating(policy):
         looks = trunk.looks(render(state, tile_size))
         seen = looks.where[0, :N_KINDS]
         said = [evidence[seen][:, tokens] for evidence in trunk.words.evidence(looks)]
-    colour, form = (evidence - evidence.mean(0) for evidence in said)
+    colour, form = ((evidence - evidence.mean(0)).cpu() for evidence in said)
     objects = tuple(kind_name(number) for number in range(1, N_KINDS + 1))
     return WordEvidence(tuple(words), objects, colour, form)

@@ -22,7 +22,7 @@ def animation(
     episodes: Sequence[Episode],
     *,
     titles: Sequence[str] | None = None,
-    actions: Sequence[str] = keys.ACTIONS,
+    actions: Sequence[str] | None = None,
     columns: int = 4,
     width: int = 200,
     fps: float = 4.0,
@@ -36,14 +36,15 @@ def animation(
     Args:
         episodes: what to show, such as :func:`~ifo_grounding.evaluation.record_episodes` returns.
         titles: a word above each, such as ``phase 1``.
-        actions: names of the actions.
+        actions: names of the actions; by default those of the grid, or numbers where it has not as
+            many: name those of another world.
         columns: episodes side by side.
         width: about how wide an episode is drawn, in pixels; frames are enlarged without blur.
         fps: actions per second.
         hold: seconds for which the end is shown.
 
     Raises:
-        UserError: without episodes, or where titles do not match them.
+        UserError: without episodes, or where titles do not match them or actions lack a name.
 
     >>> import numpy as np
     >>> frames = np.zeros((3, 3, 48, 48), dtype=np.uint8)
@@ -61,15 +62,33 @@ def animation(
         width=width,
         titled=titles is not None,
     )
+    names = action_names(actions, 1 + max(int(max(e.actions, default=0)) for e in episodes))
     labels = titles or [""] * len(episodes)
     steps = max(len(episode.frames) for episode in episodes)
     pictures = [
         sheet.draw(
-            [_cell(e, label, step, actions) for e, label in zip(episodes, labels, strict=True)]
+            [_cell(e, label, step, names) for e, label in zip(episodes, labels, strict=True)]
         )
         for step in range(steps)
     ]
     return gif(pictures, fps, hold)
+
+
+def action_names(names: Sequence[str] | None, count: int) -> Sequence[str]:
+    """Return names of actions: as said, or the grid's, or numbers where there are more.
+
+    Args:
+        names: what they are called, or None.
+        count: how many there are at least.
+
+    Raises:
+        UserError: where there are fewer names than actions.
+    """
+    if names is None:
+        return keys.ACTIONS if count <= len(keys.ACTIONS) else [*map(str, range(count))]
+    if len(names) < count:
+        raise UserError(f"there are {count} actions and {len(names)} names: name all of them")
+    return names
 
 
 def save_animation(path: str | Path, episodes: Sequence[Episode], **options: object) -> Path:

@@ -43,11 +43,27 @@ def read_metrics(path: str | Path) -> dict[str, Series]:
     if not path.exists():
         raise UserError(f"{path} does not exist: give the metrics file or log folder of a run")
     if path.suffix == ".jsonl":
-        return _collect(_json_rows(path))
-    if path.suffix == ".csv":
-        with path.open(newline="") as file:
-            return _collect(csv.DictReader(file))
-    raise UserError(f"{path} is neither .jsonl nor .csv nor a folder of metrics")
+        series = _collect(_json_rows(path))
+    elif path.suffix == ".csv":
+        series = _collect(csv.DictReader(_whole_lines(path)))
+    else:
+        raise UserError(f"{path} is neither .jsonl nor .csv nor a folder of metrics")
+    if not series:
+        raise UserError(f"{path} holds no metrics: give the metrics file or log folder of a run")
+    return series
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines(keepends=True)
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no text: give the metrics of a run") from None
+
+
+def _whole_lines(path: Path) -> list[str]:
+    """Return the lines of a file but for a last one that was cut short: a cut number is one too."""
+    lines = _lines(path)
+    return lines[:-1] if lines and not lines[-1].endswith("\n") else lines
 
 
 def _number(value: object) -> float | None:
@@ -59,16 +75,20 @@ def _number(value: object) -> float | None:
 
 
 def _json_rows(path: Path) -> list[dict[str, object]]:
-    lines = path.read_text().splitlines()
+    lines = _lines(path)
     rows = []
     for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         try:
-            rows.append(json.loads(line))
+            row = json.loads(line)
         except json.JSONDecodeError:
             if number < len(lines):
                 raise UserError(f"{path}, line {number} is not JSON: {line[:60]!r}") from None
+            continue
+        if not isinstance(row, dict):
+            raise UserError(f"{path}, line {number} is no JSON object: {line[:60]!r}")
+        rows.append(row)
     return rows
 
 
@@ -98,7 +118,7 @@ def _read_folder(folder: Path) -> dict[str, Series]:
     for file in sorted(folder.rglob("*.csv")):
         parts = file.relative_to(folder).with_suffix("").parts
         name = "/".join(part for part in parts if part != "scalars")
-        for line in file.read_text().splitlines():
+        for line in _whole_lines(file):
             pair = [_number(part) for part in line.split(",")]
             if len(pair) == 2 and pair[0] is not None and pair[1] is not None:
                 _append(series, name, pair[0], pair[1])

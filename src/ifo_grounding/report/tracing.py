@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from ifo_grounding import keys
+from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.tracing import Trace
 from ifo_grounding.report.animation import gif
 from ifo_grounding.report.plots import _dress, _figure
@@ -25,7 +26,7 @@ MAPS = 8
 def trace_animation(
     trace: Trace,
     *,
-    actions: Sequence[str] = keys.ACTIONS,
+    actions: Sequence[str] | None = None,
     steps: int = 30,
     fps: float = 1.5,
     hold: float = 3.0,
@@ -37,11 +38,20 @@ def trace_animation(
 
     Args:
         trace: from :func:`~ifo_grounding.evaluation.trace_episode`.
-        actions: names of the actions.
+        actions: names of the actions; those of the grid by default, or numbers where there are
+            more or fewer.
         steps: how many are shown at most, the last ones.
         fps: steps per second.
         hold: seconds for which the last step is shown.
+
+    Raises:
+        UserError: where there is not one name for each action.
     """
+    count = trace.probabilities.shape[-1]
+    if actions is None:
+        actions = keys.ACTIONS if count == len(keys.ACTIONS) else [*map(str, range(count))]
+    if len(actions) != count:
+        raise UserError(f"there are {count} actions and {len(actions)} names: name each of them")
     board = _Board(trace, sharpest(trace.maps, MAPS), actions)
     end = len(trace.maps)
     return gif([board.picture(step) for step in range(max(0, end - steps), end)], fps, hold)

@@ -129,9 +129,9 @@ def paired_difference(
 ) -> Difference:
     """Compare two policies on the same scenes.
 
-    The interval comes from the two-level bootstrap. Where fewer than ten scenes changed, which a
-    bootstrap tells little from, it also covers the exact ones (Clopper and Pearson) of how many
-    became better and of how many worse. With one seed ([scenes]) the p-value is
+    The interval comes from the two-level bootstrap. Where all but fewer than ten scenes fared
+    alike, which a bootstrap tells little from, it also covers the exact ones (Clopper and Pearson)
+    of how many became better and of how many worse. With one seed ([scenes]) the p-value is
     McNemar's exact test, and speaks of this pair of policies; with several ([seeds, scenes]) it is
     a t test over seeds, whose variance also counts what the scenes that they share have in common.
     Two seeds hardly ever pass it, however narrow the interval. With several seeds the interval is
@@ -164,11 +164,16 @@ def paired_difference(
     rng = np.random.default_rng(seed)
     means = _resampled_means(change, resamples, True, rng)
     low, high = (float(q) for q in np.quantile(means, (tail, 1 - tail)))
-    if better + worse < FEW_CHANGES:
-        up, down = better / len(change), worse / len(change)  # of one seed
-        scenes = change.shape[1]
-        low = min(low, up / scenes - _exact_upper(down, scenes, tail))
+    up, down = better / len(change), worse / len(change)  # of one seed
+    scenes = change.shape[1]
+    if better + worse < FEW_CHANGES or change.size - better < FEW_CHANGES:
         high = max(high, _exact_upper(up, scenes, tail) - down / scenes)
+    if better + worse < FEW_CHANGES or change.size - worse < FEW_CHANGES:
+        low = min(low, up / scenes - _exact_upper(down, scenes, tail))
+    if change.size - better < FEW_CHANGES:
+        low = min(low, 1 - _exact_upper(scenes - up, scenes, tail) - down / scenes)
+    if change.size - worse < FEW_CHANGES:
+        high = max(high, up / scenes - 1 + _exact_upper(scenes - down, scenes, tail))
     if len(change) == 1:
         p_value = 1.0
         if better + worse:
@@ -205,8 +210,8 @@ def _t_test(change: NDArray[np.float64]) -> float:
         rest /= (seeds - 1) * (scenes - 1) * change.size
         error += max(0.0, by_scene.var(ddof=1) / scenes - rest)
     error = math.sqrt(error)
-    if not error:
-        return 0.0 if change.any() else 1.0
+    if not error:  # every scene fares alike with every seed
+        return float(scipy_stats.binomtest(scenes, scenes).pvalue) if change.mean() else 1.0
     return float(2 * scipy_stats.t.sf(abs(change.mean()) / error, seeds - 1))
 
 

@@ -22,7 +22,7 @@ def _digits(rate: float, width: float) -> int:
     """
     rare = min(rate, 1.0 - rate)
     if not rare:
-        return 1
+        return 1 if width >= 0.0005 else 2 if width >= 0.00005 else 3
     if rare < 0.00005:
         return 3
     return 2 if rare < 0.0005 or width < 0.0015 else 1

@@ -71,6 +71,10 @@ class SceneOptions:
     def __post_init__(self) -> None:
         """Refuse unknown names."""
         check_task(self.task)
+        if not isinstance(self.layout, Layout):
+            raise UserError(
+                f"a layout is a Layout, such as Layout(size=8), got {type(self.layout).__name__}"
+            )
         check_choice("split", self.split, SPLITS)
         check_choice("stream", self.stream, STREAMS)
         holdout_kinds(self.holdout)
