@@ -138,3 +138,9 @@ def test_a_policy_acts_in_the_real_env():
     out = env.rollout(4, make_policy(env, seed=0), break_when_any_done=False)
     assert out.shape == (3, 4)
     assert out["action_log_prob"].shape == (3, 4)
+
+
+def test_sizes_of_images_may_be_a_list():
+    """As options and JSON give them."""
+    shapes = Shapes(image_shape=[3, 48, 48], vocabulary_size=40)
+    assert shapes == Shapes(image_shape=(3, 48, 48), vocabulary_size=40)

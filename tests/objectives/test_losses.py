@@ -1,5 +1,6 @@
 """Values worked out by hand, from networks that answer what they are told."""
 
+import copy
 import math
 from functools import partial
 
@@ -12,7 +13,13 @@ from torch.distributions import Categorical
 from torchrl.modules import OneHotCategorical, ProbabilisticActor
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import Shapes, WordMaps, make_instruction_classifier
+from ifo_grounding.networks import (
+    Shapes,
+    WordMaps,
+    make_instruction_classifier,
+    make_policy,
+    make_reward_model,
+)
 from ifo_grounding.objectives import (
     GoalLoss,
     ImitationLoss,
@@ -468,3 +475,35 @@ def test_the_share_of_suitable_pairs_comes_from_random_ones_alone(fresh):
     loss(batch())
     assert loss.count == 3 and loss.negatives.uniform(3) == 2
     assert seen == [2 + fresh]  # two of the three others, and itself in fresh states
+
+
+def some_steps(action="action"):
+    return TensorDict(
+        {
+            "pixels": torch.randint(255, (4, 3, 48, 48), dtype=torch.uint8),
+            "instruction": torch.randint(1, 30, (4, 16)),
+            action: torch.zeros(4, dtype=torch.int64),
+        },
+        [4],
+    )
+
+
+def test_what_words_said_to_another_loss_is_not_charged_for():
+    policy = make_policy(Shapes((3, 48, 48), 40), "strong", seed=0).train()
+    steps = some_steps()
+    policy.get_dist(steps.copy()).log_prob(steps["action"]).mean().backward()
+    copy.deepcopy(policy)  # of a network, not of a graph
+    losses = ImitationLoss(policy.eval()).eval()(steps)
+    assert "loss_words" not in losses
+
+
+def test_judges_learn_actions_of_another_name():
+    shapes = Shapes((3, 48, 48), 40)
+    losses = []
+    for name in ("action", "expert_action"):
+        torch.manual_seed(0)
+        loss = RewardLoss(make_reward_model(shapes, "film", seed=0))
+        loss.set_keys(action=name)
+        assert loss.in_keys == ["pixels", "instruction", name]
+        losses.append(loss(some_steps(name))["loss_reward"])
+    assert losses[0] == losses[1]

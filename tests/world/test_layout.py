@@ -132,3 +132,15 @@ def test_places_are_drawn_as_topk_draws_them(cells, values):
     for k in (1, 8, cells):
         assert torch.equal(highest(lots, k), lots.topk(k).indices)
     assert highest(lots, 0).shape == (5000, 0)
+
+
+def test_worlds_do_not_depend_on_the_default_dtype():
+    def drawn():
+        return random_layout(100, generator=torch.Generator().manual_seed(0))
+
+    usual = drawn()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert (drawn() == usual).all()
+    finally:
+        torch.set_default_dtype(torch.float32)

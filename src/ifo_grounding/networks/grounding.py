@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -80,6 +81,10 @@ class WordMaps(nn.Module):
         self.manner = nn.Linear(hidden, MANNER)
         self.register_buffer("usual", torch.zeros(vocabulary_size, maps))
         self.charge: Tensor | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: not the charge, a part of a graph."""
+        return {**self.__dict__, "charge": None}
 
     def forward(self, looks: Looks, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps' logits [N, maps, h * w] and the manner [N, MANNER]."""

@@ -39,6 +39,7 @@ n_actions=6, tile_size=None)
             raise UserError(
                 f"image_shape must be (channels, height, width), got {self.image_shape}"
             )
+        object.__setattr__(self, "image_shape", tuple(map(int, self.image_shape)))
         for name in ("vocabulary_size", "instruction_length", "n_actions"):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
                 raise UserError(f"{name} must be a positive integer, got {getattr(self, name)!r}")

@@ -66,6 +66,10 @@ class SupervisedLoss(LossModule):
         """The network is used as it is: nothing is copied or made stateless."""
         return False
 
+    def _own_keys(self) -> list[NestedKey]:
+        """Return the keys that are read because the network reads them."""
+        return list(self.network.in_keys)
+
     def _extra_keys(self) -> list[NestedKey]:
         """Return the keys read besides the network's own."""
         return [self.tensor_keys.action]
@@ -73,7 +77,7 @@ class SupervisedLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Every key that :meth:`forward` reads."""
-        own = list(self.network.in_keys)
+        own = self._own_keys()
         return own + [key for key in self._extra_keys() if key not in own]
 
     @in_keys.setter

@@ -87,6 +87,7 @@ class ImitationLoss(SupervisedLoss):
         """Compute the loss of a batch of labelled transitions."""
         self._require(tensordict)
         action = tensordict.get(self.tensor_keys.action)
+        take_charge(self.network)  # of what another loss looked at
         with self._mode():
             dist = self.network.get_dist(tensordict.select(*self.network.in_keys))
         likeliest = dist.mode

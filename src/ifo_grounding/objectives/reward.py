@@ -68,6 +68,10 @@ class RewardLoss(SupervisedLoss):
             raise UserError("a single action has no different ones to serve as negatives")
         self.generator = generator
 
+    def _own_keys(self) -> list[NestedKey]:
+        """The network's inputs but for the action, which is the labelled one or another."""
+        return list(self.network.in_keys)[:-1]
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of labelled actions against randomly different ones."""

@@ -224,7 +224,9 @@ def propose_goal(state: WorldState, task: int, source: Generators) -> Goal:
 
     def drawn() -> Tensor:
         return draw_rows(
-            lambda n, draw: torch.rand(n, state.objects.shape[-1], generator=draw),
+            lambda n, draw: torch.rand(
+                n, state.objects.shape[-1], generator=draw, dtype=torch.float32
+            ),
             len(state.arm),
             source,
         )

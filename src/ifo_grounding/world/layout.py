@@ -69,7 +69,9 @@ def random_layout(
 
     def rand(*shape: int) -> Tensor:
         return draw_rows(
-            lambda rows, source: torch.rand(rows, *shape, generator=source, device=device),
+            lambda rows, source: torch.rand(
+                rows, *shape, generator=source, device=device, dtype=torch.float32
+            ),
             batch,
             generator,
         )
