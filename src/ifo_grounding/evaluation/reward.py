@@ -25,7 +25,6 @@ from ifo_grounding.evaluation.episodes import (
 )
 from ifo_grounding.evaluation.labels import actions_of
 from ifo_grounding.modules import evaluating
-from ifo_grounding.networks.trunk import Network
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.stats import Estimate, Rate, auc, correlation, wilson
 from ifo_grounding.transforms import LearnedReward
@@ -119,10 +118,9 @@ def reward_audit(
 
 def _names_for(model: TensorDictModuleBase, names: Sequence[str] | None) -> Sequence[str]:
     """Return a name for each action that a judge knows, as far as it says how many that are."""
-    networks = (each for each in model.modules() if isinstance(each, Network))
-    known = next((each.shapes.n_actions for each in networks), len(names or keys.ACTIONS))
+    known = getattr(getattr(model, "shapes", None), "n_actions", len(names or keys.ACTIONS))
     if names is None:
-        return keys.ACTIONS if known == len(keys.ACTIONS) else [*map(str, range(known))]
+        return keys.action_names(known)
     if len(names) != known:
         raise UserError(f"the model judges {known} actions, not {len(names)}: name each of them")
     return names

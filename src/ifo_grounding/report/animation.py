@@ -62,7 +62,10 @@ def animation(
         width=width,
         titled=titles is not None,
     )
-    names = action_names(actions, 1 + max(int(max(e.actions, default=0)) for e in episodes))
+    count = 1 + max(int(max(e.actions, default=0)) for e in episodes)
+    names = keys.action_names(max(count, keys.N_ACTIONS)) if actions is None else actions
+    if len(names) < count:
+        raise UserError(f"there are {count} actions and {len(names)} names: name all of them")
     labels = titles or [""] * len(episodes)
     steps = max(len(episode.frames) for episode in episodes)
     pictures = [
@@ -72,23 +75,6 @@ def animation(
         for step in range(steps)
     ]
     return gif(pictures, fps, hold)
-
-
-def action_names(names: Sequence[str] | None, count: int) -> Sequence[str]:
-    """Return names of actions: as said, or the grid's, or numbers where there are more.
-
-    Args:
-        names: what they are called, or None.
-        count: how many there are at least.
-
-    Raises:
-        UserError: where there are fewer names than actions.
-    """
-    if names is None:
-        return keys.ACTIONS if count <= len(keys.ACTIONS) else [*map(str, range(count))]
-    if len(names) < count:
-        raise UserError(f"there are {count} actions and {len(names)} names: name all of them")
-    return names
 
 
 def save_animation(path: str | Path, episodes: Sequence[Episode], **options: object) -> Path:

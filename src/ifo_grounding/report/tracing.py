@@ -49,7 +49,7 @@ def trace_animation(
     """
     count = trace.probabilities.shape[-1]
     if actions is None:
-        actions = keys.ACTIONS if count == len(keys.ACTIONS) else [*map(str, range(count))]
+        actions = keys.action_names(count)
     if len(actions) != count:
         raise UserError(f"there are {count} actions and {len(actions)} names: name each of them")
     board = _Board(trace, sharpest(trace.maps, MAPS), actions)

@@ -166,13 +166,17 @@ def paired_difference(
     low, high = (float(q) for q in np.quantile(means, (tail, 1 - tail)))
     up, down = better / len(change), worse / len(change)  # of one seed
     scenes = change.shape[1]
-    if better + worse < FEW_CHANGES or change.size - better < FEW_CHANGES:
+    few, won, lost = (
+        others < FEW_CHANGES
+        for others in (better + worse, change.size - better, change.size - worse)
+    )
+    if few or won:
         high = max(high, _exact_upper(up, scenes, tail) - down / scenes)
-    if better + worse < FEW_CHANGES or change.size - worse < FEW_CHANGES:
+    if few or lost:
         low = min(low, up / scenes - _exact_upper(down, scenes, tail))
-    if change.size - better < FEW_CHANGES:
+    if won:
         low = min(low, 1 - _exact_upper(scenes - up, scenes, tail) - down / scenes)
-    if change.size - worse < FEW_CHANGES:
+    if lost:
         high = max(high, up / scenes - 1 + _exact_upper(scenes - down, scenes, tail))
     if len(change) == 1:
         p_value = 1.0
