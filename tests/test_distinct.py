@@ -28,3 +28,10 @@ def test_rows_that_mirror_each_other_do_not_collide():
 def test_no_rows():
     rows, index = distinct_rows(torch.zeros(0, 5, dtype=torch.int64))
     assert rows.shape == (0, 5) and index.shape == (0,)
+
+
+def test_what_a_vmap_with_random_numbers_asked_first_serves_all_others():
+    distinct._factors.cache_clear()
+    torch.vmap(lambda rows: rows + distinct._factors(3)[0], randomness="different")(torch.ones(2))
+    rows = torch.tensor([[1, 2, 3], [1, 2, 3]])
+    assert distinct_rows(rows)[0].tolist() == [[1, 2, 3]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -37,12 +38,12 @@ def _hash(rows: Tensor) -> Tensor:
     """Hash rows [M, W] to 64 bits each: a sum weighed by odd numbers, modulo 2^64."""
     mixed = rows >> 29
     mixed ^= rows
-    mixed *= _factors(rows.shape[1]).to(rows.device)
+    mixed *= torch.tensor(_factors(rows.shape[1]), device=rows.device)
     return mixed.sum(-1)
 
 
 @functools.cache
-def _factors(count: int) -> Tensor:
-    """Return odd 64-bit numbers without any pattern, int64 [count]."""
-    source = torch.Generator().manual_seed(0)
-    return torch.randint(-(2**63), 2**63 - 1, (count,), generator=source) | 1
+def _factors(count: int) -> list[int]:
+    """Return odd 64-bit numbers without any pattern; a tensor could belong to someone's vmap."""
+    source = np.random.default_rng(0)
+    return (source.integers(-(2**63), 2**63 - 1, count) | 1).tolist()

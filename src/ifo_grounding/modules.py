@@ -46,6 +46,15 @@ def device_of(module: object) -> torch.device | None:
     return None
 
 
+def charges(module: nn.Module) -> bool:
+    """Whether a part of a module charges for what it computes in train mode.
+
+    >>> charges(nn.Linear(1, 1))
+    False
+    """
+    return any(hasattr(part, "charge") for part in module.modules())
+
+
 def take_charge(module: nn.Module) -> Tensor | None:
     """Take what the parts of a module charge for their last batch, None where none does.
 

@@ -91,8 +91,8 @@ def lay(pixels: Tensor, table: Tensor, places: Tensor, tiles: Tensor) -> None:
     begin = first.index_select(0, places - picture * len(first))
     begin.add_(picture, alpha=len(first) * len(rest))
     drawn = table.flatten(1).index_select(0, tiles)
-    # On a CPU put_ takes half as long as scatter_.
-    pixels.view(torch.int64).put_((begin.unsqueeze(-1) + rest).view(-1), drawn.view(-1))
+    words = pixels.view(torch.int64).view(-1)
+    words.scatter_(0, (begin.unsqueeze(-1) + rest).view(-1), drawn.view(-1))
 
 
 @functools.cache

@@ -545,3 +545,35 @@ def test_other_actions_are_refused(actions, said):
     env = PickAndPlaceEnv("move", num_envs=3, seed=0)
     with pytest.raises(UserError, match=said):
         env.step(env.reset().set("action", torch.tensor(actions)))
+
+
+@pytest.mark.parametrize("num_envs", [4, 300])
+@pytest.mark.parametrize("options", [{}, {"expose_state": True}, {"instructed": False}], ids=str)
+def test_episodes_that_begin_in_inference_mode_go_on_outside(num_envs, options):
+    def begin():
+        torch.manual_seed(0)
+        env = PickAndPlaceEnv("pick", num_envs=num_envs, seed=0, **options)
+        return env, env.rollout(30, break_when_any_done=False)
+
+    with torch.inference_mode():
+        env, first = begin()
+    plain, expected = begin()
+    assert (first == expected).all()
+    torch.manual_seed(1)
+    rest = env.rollout(30, break_when_any_done=False)
+    torch.manual_seed(1)
+    assert (rest == plain.rollout(30, break_when_any_done=False)).all()
+
+
+@pytest.fixture
+def deterministic():
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.usefixtures("deterministic")
+def test_many_worlds_run_with_deterministic_algorithms():
+    env = PickAndPlaceEnv("pick", num_envs=300, seed=0)
+    rollout = env.rollout(8, break_when_any_done=False)
+    assert torch.equal(rollout["next", "pixels"][:, -1], env.simulator.pixels(tile_size=8))

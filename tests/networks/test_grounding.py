@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 
+from ifo_grounding import distinct
 from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import episode_endings
@@ -219,3 +220,26 @@ def test_padding_says_nothing(shapes):
     both = logits(tokens)
     torch.testing.assert_close(logits(tokens[:1]), both[:1])
     torch.testing.assert_close(logits(F.pad(tokens, (0, 9))), both)
+
+
+def test_several_policies_run_side_by_side(shapes):
+    policies = [make_policy(shapes, "strong", seed=seed) for seed in (0, 1)]
+    batch = TensorDict(
+        {
+            "pixels": tiles("red circle", "blue triangle"),
+            "instruction": VOCABULARY.encode(["move to the red circle"]),
+        },
+        [1],
+    )
+    for policy in policies:
+        trunk_of(policy).words.usual.uniform_()
+    expected = torch.stack([policy(batch.copy())["logits"] for policy in policies])
+    distinct._factors.cache_clear()
+    parameters, buffers = torch.func.stack_module_state(policies)
+
+    def run(*weights):
+        return torch.func.functional_call(policies[0], weights, (batch.copy(),))["logits"]
+
+    found = torch.vmap(run, randomness="different")(parameters, buffers)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+    assert policies[0](batch.copy())["logits"].shape == (1, 6)  # nothing was left behind

@@ -141,6 +141,25 @@ def test_impossible_configurations_are_refused(name, value):
         NetworkConfig.of("policy", **{name: value})
 
 
+@pytest.mark.parametrize(
+    ("preset", "options", "said"),
+    [
+        ("film", {"kernel": 2}, "kernel must be odd.*got 2"),
+        ("film", {"kernel": 0}, "kernel must be at least 1, got 0"),
+        ("paper", {"conv_layers": 0}, "conv_layers must be at least 1, got 0"),
+        ("paper", {"matching": "words", "maps": 8}, "needs preset 'strong' or 'film'"),
+        ("film", {"matching": "words"}, "maps must be at least 1, got 0"),
+        ("strong", {"hidden": 1}, "hidden must be at least 2, got 1"),
+        ("strong", {"context": -1}, "context must be at least 0, got -1"),
+        ("film", {"n_blocks": -1}, "n_blocks must be at least 0, got -1"),
+        ("strong", {"head_hidden": (8, 0)}, r"head_hidden must be at least 1, got \(8, 0\)"),
+    ],
+)
+def test_sizes_that_make_no_network_are_refused(preset, options, said):
+    with pytest.raises(UserError, match=said):
+        NetworkConfig.of("policy", preset, **options)
+
+
 def test_presets_are_what_the_design_says():
     paper = NetworkConfig.of("policy", "paper")
     assert (paper.conv_layers, paper.features, paper.hidden, paper.embedding) == (4, 32, 64, 8)
@@ -169,3 +188,20 @@ def test_precision_is_the_callers_unless_it_is_given(kind, preset, shapes):
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(run(kind, make(), data)[0], rough)
         assert torch.equal(run(kind, make(precision="fp32"), data)[0], exact)
+
+
+@pytest.mark.parametrize(("precision", "off"), [(torch.float64, 1e-4), (torch.bfloat16, 0.1)])
+@pytest.mark.parametrize("alike", [True, False])  # cells that repeat are seen once
+@pytest.mark.parametrize("image", [torch.uint8, torch.float32])
+def test_networks_of_another_precision_read_all_images(
+    kind, preset, shapes, precision, off, alike, image
+):
+    data = inputs(shapes, [8])
+    for name in ("pixels", "initial_pixels", ("next", "pixels")):
+        pixels = data[name][..., :1, :1].expand_as(data[name]) if alike else data[name]
+        data[name] = pixels.clone() if image == torch.uint8 else pixels / 255
+    network = MAKERS[kind](shapes, preset, seed=0)
+    expected, _ = run(kind, network, data)
+    torch.testing.assert_close(
+        run(kind, network.to(precision), data)[0].float(), expected, atol=off, rtol=off
+    )

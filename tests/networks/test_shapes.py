@@ -3,7 +3,15 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    OneHot,
+    Unbounded,
+)
 from torchrl.envs import ParallelEnv, RenameTransform, SerialEnv, StepCounter, TransformedEnv
 
 from ifo_grounding.attributes import stop_of
@@ -144,3 +152,34 @@ def test_sizes_of_images_may_be_a_list():
     """As options and JSON give them."""
     shapes = Shapes(image_shape=[3, 48, 48], vocabulary_size=40)
     assert shapes == Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        Bounded(-1.0, 1.0, (5, 2)),
+        Bounded(1, 4, (5,), dtype=torch.int64),
+        MultiCategorical([3, 2], shape=(5, 2)),
+        Binary(4, shape=(5, 4)),
+        Categorical(4, shape=(5, 1)),
+        Unbounded((5,), dtype=torch.int64),
+    ],
+    ids=lambda spec: type(spec).__name__,
+)
+def test_actions_that_are_no_number_of_a_choice_are_refused(action):
+    source = env(INSTRUCTIONS["categorical"], action)
+    with pytest.raises(UserError, match=r"'action' is \w+ of shape \[5.*one discrete action"):
+        Shapes.of(source)
+    source.n_actions = 4  # of an environment that says so itself
+    assert Shapes.of(source).n_actions == 4
+
+
+def test_bounded_whole_numbers_are_a_choice():
+    action = Bounded(0, 3, (5,), dtype=torch.int64)
+    assert Shapes.of(env(INSTRUCTIONS["categorical"], action)).n_actions == 4
+
+
+def test_images_whose_channels_come_last_are_refused():
+    with pytest.raises(UserError, match=r"\(48, 40, 3\) looks like.*PermuteTransform"):
+        Shapes(image_shape=(48, 40, 3), vocabulary_size=9)
+    assert Shapes(image_shape=(12, 48, 40), vocabulary_size=9)  # of stacked frames

@@ -29,7 +29,7 @@ LOSSES = {
 }
 
 
-@pytest.fixture(params=["film", "paper"])
+@pytest.fixture(params=["film", "strong", "paper"])
 def preset(request):
     return request.param
 

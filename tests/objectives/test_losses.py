@@ -456,6 +456,37 @@ def test_negatives_that_were_not_removed_count_as_the_mixture_that_they_are(pres
     assert (sure.diff() > 0).all() and sure[-1] < 1
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_training_goes_on_after_calibration_as_if_there_had_been_none(share):
+    """Otherwise the loss would undo it, and a second calibration say it once more."""
+    loss = make_loss("instruction", removal_rate="estimated")
+    ones = int(1000 * share)
+    loss.negatives.watch(torch.ones(1000), torch.cat([torch.ones(ones), -torch.ones(1000 - ones)]))
+    data, network = batch(), loss.network
+    torch.manual_seed(0)
+    before = loss.eval()(data)
+    likely = network(data.copy())["suitability"]
+    loss.calibrate()
+    calibrated = network(data.copy())["suitability"]
+    assert (calibrated - likely).abs().min() > 0.1
+    torch.manual_seed(0)
+    torch.testing.assert_close(loss(data).to_dict(), before.to_dict(), atol=0, rtol=0)
+    assert torch.equal(network(data.copy())["suitability"], calibrated)
+
+
+def test_a_network_that_cannot_be_told_how_rare_suitable_pairs_are_is_named():
+    loss = InstructionLoss(suitability([0.9, 0.6]), torch.tensor([[1, 0], [2, 0]]))
+    loss.negatives.watch(torch.ones(1000), torch.cat([torch.ones(300), -torch.ones(700)]))
+    with pytest.raises(UserError, match=r"Suitability has no method expect\(share, mixed\)"):
+        loss.calibrate()
+
+
+def test_a_pool_of_another_length_is_refused():
+    loss = make_loss("instruction", pool=POOL[:, :-1])
+    with pytest.raises(UserError, match="one vocabulary"):
+        loss(batch())
+
+
 def test_few_suitable_pairs_are_not_removed():
     pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
     negatives = NegativeInstructions(pool, "estimated")

@@ -47,7 +47,13 @@ def test_bad_sentences_are_refused(sentence, said):
 
 @pytest.mark.parametrize(
     ("words", "said"),
-    [(["a", "a"], "twice"), (["A"], "lower case"), (["a "], "spaces"), ([""], "lower case")],
+    [
+        (["a", "a"], "twice"),
+        (["A"], "lower case"),
+        (["a "], "spaces"),
+        (["a b"], "spaces"),
+        ([""], "lower case"),
+    ],
 )
 def test_bad_vocabularies_are_refused(words, said):
     with pytest.raises(UserError, match=said):

@@ -211,8 +211,7 @@ class PickAndPlaceEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
-            # A copy: later resets write into the simulator's state, not into the caller's.
-            self.simulator.state = self._world(given).clone()
+            self.simulator.state = self._world(given)
         success, terminated, truncated = self.simulator.step(tensordict.get(keys.ACTION))
         result = self._observe()
         result[keys.REWARD] = success.float().unsqueeze(-1)

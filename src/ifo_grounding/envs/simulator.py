@@ -44,6 +44,9 @@ def check_actions(action: Tensor, worlds: int, count: int) -> None:
 class Simulator:
     """Runs ``num_envs`` episodes of numbered scenes side by side.
 
+    What it keeps is no inference tensor, so that episodes go on outside ``torch.inference_mode``
+    that began inside.
+
     Args:
         options: which scenes.
         num_envs: episodes side by side.
@@ -52,6 +55,7 @@ class Simulator:
         device: where the worlds live.
     """
 
+    @torch.inference_mode(False)
     def __init__(
         self,
         options: SceneOptions,
@@ -83,6 +87,7 @@ class Simulator:
         self.stream = SceneStream(self.options, seed, self.device)
         self.next_number = 0
 
+    @torch.inference_mode(False)
     def to(self, device: torch.device | str) -> Simulator:
         """Move the running episodes and all that follow to a device."""
         if (device := torch.device(device)) == self.device:
@@ -109,8 +114,10 @@ class Simulator:
         return self._running.state
 
     @state.setter
+    @torch.inference_mode(False)
     def state(self, state: WorldState) -> None:
-        self._running.state = state
+        # A copy: later resets write into the simulator's state, not into the caller's.
+        self._running.state = state.clone()
         self._touched = None
 
     @property
@@ -128,6 +135,7 @@ class Simulator:
         assert self._episodes is not None, "reset first"
         return self._episodes
 
+    @torch.inference_mode(False)
     def reset(self, rows: Tensor, numbers: Tensor | None = None) -> None:
         """Begin new episodes in some rows.
 
@@ -146,6 +154,7 @@ class Simulator:
             self._begin(rows)
         self.numbers[rows] = numbers
 
+    @torch.inference_mode(False)
     def place(self, rows: Tensor, scenes: Scene) -> None:
         """Begin episodes with given scenes [R] in some rows."""
         if self._episodes is None:
@@ -169,6 +178,7 @@ class Simulator:
             first = self._first_cell.index_select(0, rows).unsqueeze(-1)
             self._touched.append((first + cells).view(-1))
 
+    @torch.inference_mode(False)
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Apply one action, int64 [num_envs], to each row.
 
@@ -193,6 +203,7 @@ class Simulator:
             return torch.zeros_like(ended), terminated, truncated
         return ended & fulfilled(state, self.wanted), terminated, truncated
 
+    @torch.inference_mode(False)
     def pixels(self, rows: Tensor | None = None, tile_size: int | None = None) -> Tensor:
         """Draw some rows or all of them, uint8 [R, 3, H, W]."""
         if rows is None and tile_size is None:

@@ -77,11 +77,7 @@ class NetworkConfig:
         check_choice("words", self.words, ("gru", "conv"))
         check_choice("sentence_pooling", self.sentence_pooling, POOLINGS)
         check_choice("precision", self.precision, (None, "auto", "fp32", "bf16"))
-        for name in ("features", "embedding", "hidden"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.patch_size is not None and self.patch_size < 1:
-            raise UserError(f"patch_size must be at least 1, got {self.patch_size}")
+        self._check_sizes()
         if not 0 < self.sentence_rate <= 1:
             raise UserError(f"sentence_rate must lie in (0, 1], got {self.sentence_rate}")
         if self.sentence_rate != 1 and self.preset != "paper":
@@ -89,6 +85,33 @@ class NetworkConfig:
         if not 0 <= self.dropout < 1:
             raise UserError(f"dropout must lie in [0, 1), got {self.dropout}")
         object.__setattr__(self, "head_hidden", tuple(self.head_hidden))
+        if any(size < 1 for size in self.head_hidden):
+            raise UserError(f"sizes in head_hidden must be at least 1, got {self.head_hidden}")
+
+    def _check_sizes(self) -> None:
+        by_word = self.matching == "words"
+        if by_word and self.preset == "paper":
+            raise UserError("matching='words' reads patches: it needs preset 'strong' or 'film'")
+        least = {
+            "features": 1,
+            "conv_layers": 1 if self.preset == "paper" else 0,
+            "n_blocks": 0,
+            "kernel": 1,
+            "context": 0,
+            "heads": 0,
+            "values": 0,
+            "detectors": 0,
+            "maps": 1 if by_word else 0,
+            "embedding": 1,
+            "hidden": 2 if by_word else 1,
+        }
+        if self.patch_size is not None:
+            least["patch_size"] = 1
+        for name, lowest in least.items():
+            if getattr(self, name) < lowest:
+                raise UserError(f"{name} must be at least {lowest}, got {getattr(self, name)}")
+        if self.kernel % 2 == 0:
+            raise UserError(f"kernel must be odd, for a cell lies in its middle, got {self.kernel}")
 
     @classmethod
     def of(cls, kind: str, preset: str = "strong", **overrides: Any) -> NetworkConfig:

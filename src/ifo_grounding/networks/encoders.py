@@ -53,7 +53,7 @@ class ConvEncoder(nn.Module):
         first, *others = self.convolutions
         views = distinct_views(image, 1 + len(others)) if others else None
         if views is None:
-            return self.layers(as_float(image))
+            return self.layers(as_float(image, first.weight))
         features = _two_layers(first, others[0], views.windows)
         for layer, blocks in zip(others[1:], views.blocks, strict=False):
             seen = look_up(F.pad(features, (0, 0, 1, 0)), blocks)  # zeros beyond the edges
@@ -78,7 +78,7 @@ def begin_before_relu(layer: nn.Conv2d | nn.Linear) -> None:
 
 def _two_layers(first: nn.Conv2d, second: nn.Conv2d, windows: Windows) -> Tensor:
     """Map windows to what two convolutions of kernel 3 and stride 2 make of each, [U, F]."""
-    seen = as_float(windows.pixels).contiguous(memory_format=torch.channels_last)
+    seen = as_float(windows.pixels, first.weight).contiguous(memory_format=torch.channels_last)
     features = F.relu(F.conv2d(seen, first.weight, first.bias, stride=2)).permute(0, 2, 3, 1)
     inside = features.new_ones(len(features), 3, 3, 1)
     inside[windows.top, 0] = 0  # the second layer sees zeros beyond the edges
@@ -110,7 +110,9 @@ class PatchEncoder(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w], channels last in memory."""
-        return self.embed(as_float(patches(image, self.patch))).permute(0, 3, 1, 2)
+        return self.embed(as_float(patches(image, self.patch), self.embed.weight)).permute(
+            0, 3, 1, 2
+        )
 
     def cells(
         self, image: Tensor, complete: Callable[[Tensor], Tensor] | None = None
@@ -129,7 +131,7 @@ class PatchEncoder(nn.Module):
         distinct, index = found
         if complete is not None:
             distinct = complete(distinct)
-        return Cells(self.embed(as_float(distinct.flatten(1))), index)
+        return Cells(self.embed(as_float(distinct.flatten(1), self.embed.weight)), index)
 
     @staticmethod
     def grid(height: int, width: int, patch: int) -> tuple[int, int]:

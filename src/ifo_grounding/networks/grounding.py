@@ -134,7 +134,7 @@ class WordMaps(nn.Module):
 
     def _in_use(self, tokens: Tensor) -> Tensor | None:
         """Return the words that count anything, said now or before; None where that is unknown."""
-        if not tokens.numel() or hidden_from_python(tokens):
+        if not tokens.numel() or hidden_from_python(tokens) or hidden_from_python(self.usual):
             return None
         counts = (self.usual != 0).any(1)
         counts[tokens] = True

@@ -79,7 +79,8 @@ class InverseNetwork(Network):
         first, second, index = distinct_pairs(*codes, len(tiles), len(tiles))
         seen = torch.cat([tiles[first], tiles[second]], 1).flatten(2)
         with self.autocast(tiles):
-            features = self.image.embed(as_float(_with_change(seen).flatten(1)))
+            pixels = as_float(_with_change(seen).flatten(1), self.image.embed.weight)
+            features = self.image.embed(pixels)
             outputs = self._judged(Cells(features, index).maps(height, width))
         return outputs.float()
 

@@ -77,9 +77,9 @@ class ColourAndForm(nn.Module):
 
     def tiles(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Cut [N, C, H, W] into cells [U, C, P * P], and say which lies where [N, h * w]."""
-        found = distinct_patches(image, self.patch)
+        weight, found = self.colour.weight, distinct_patches(image, self.patch)
         if found is not None:
-            return as_float(found[0]), found[1]
-        every = as_float(patches(image, self.patch))  # [N, h, w, C * P * P]
+            return as_float(found[0], weight), found[1]
+        every = as_float(patches(image, self.patch), weight)  # [N, h, w, C * P * P]
         tiles = every.flatten(0, 2).unflatten(-1, (image.shape[1], -1))
         return tiles, torch.arange(len(tiles), device=image.device).view(len(image), -1)

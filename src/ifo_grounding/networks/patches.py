@@ -59,11 +59,14 @@ def is_plain(image: Tensor) -> bool:
     return plain and not hidden_from_python(image)
 
 
-def as_float(pixels: Tensor) -> Tensor:
-    """Scale uint8 pixels to [0, 1]; floating-point pixels are taken as scaled already."""
+def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
+    """Return pixels in the precision of the weights that read them.
+
+    Bytes are scaled to [0, 1]; floating-point pixels are taken as scaled already.
+    """
     if pixels.dtype == torch.uint8:
-        return pixels.to(torch.get_default_dtype()).mul_(1 / 255)
-    return pixels
+        return pixels.to(weight.dtype).mul_(1 / 255)
+    return pixels.to(weight.dtype)
 
 
 def patches(image: Tensor, patch: int) -> Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 
 import torch
 import torch.nn.functional as F
@@ -71,6 +73,7 @@ class PairScorer(Network):
     def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
         super().__init__(shapes, config)
         self.images = images
+        self.expects = True
         self.register_buffer("prior", torch.zeros(()))
         self.register_buffer("mixed", torch.zeros(()))
 
@@ -90,9 +93,21 @@ class PairScorer(Network):
         self.prior.fill_(math.log(share) if mixed else math.log(share / (1 - share)))
         self.mixed.fill_(mixed)
 
+    @contextlib.contextmanager
+    def as_learned(self) -> Iterator[None]:
+        """Score without what :meth:`expect` said, as a loss that goes on training has to."""
+        before, self.expects = self.expects, False
+        try:
+            yield
+        finally:
+            self.expects = before
+
     def _expected(self, scores: Tensor) -> Tensor:
         """Return logits in the light of what :meth:`expect` said."""
-        scores = scores.float() + self.prior
+        scores = scores.float()
+        if not self.expects:
+            return scores
+        scores = scores + self.prior
         return scores - self.mixed * torch.log1p(-scores.clamp(max=math.log(SUREST)).exp())
 
     def encode_pixels(self, *pixels: Tensor) -> Tensor:

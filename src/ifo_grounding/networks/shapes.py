@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from tensordict.utils import NestedKey
-from torchrl.data import OneHot, Unbounded
+from torchrl.data import Bounded, Categorical, OneHot, Unbounded
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import NetworkConfig
+
+MOST_CHANNELS = 4
+"""Of a picture: red, green, blue and opacity. No picture is so narrow."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,13 @@ n_actions=6, tile_size=None)
             raise UserError(
                 f"image_shape must be (channels, height, width), got {self.image_shape}"
             )
+        channels, _, width = self.image_shape
+        if width <= MOST_CHANNELS < channels:
+            raise UserError(
+                f"image_shape is (channels, height, width), and {tuple(self.image_shape)} looks "
+                "like one whose channels come last: permute images first, an environment's with "
+                "torchrl.envs.PermuteTransform((-1, -3, -2))"
+            )
         object.__setattr__(self, "image_shape", tuple(map(int, self.image_shape)))
         for name in ("vocabulary_size", "instruction_length", "n_actions"):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
@@ -63,7 +73,8 @@ n_actions=6, tile_size=None)
             action: where an env's spec describes actions; an env's only action has any name.
 
         Raises:
-            UserError: where a size can be read from neither an attribute nor a spec.
+            UserError: where a size can be read from neither an attribute nor a spec, where actions
+                are not one of a number each, or images have their channels last.
         """
         if isinstance(source, cls):
             return source
@@ -113,11 +124,30 @@ def _from_specs(
         found.append(("instruction_length", int(spec.shape[-1])))
         found.append(("vocabulary_size", _count(spec)))
     actions = getattr(env, "full_action_spec", None)
-    if actions is not None:
+    if actions is not None and attribute(env, "n_actions") is None:
         names = list(actions.keys(True, True))
         if action in names or len(names) == 1:
-            found.append(("n_actions", _count(actions[action if action in names else names[0]])))
+            name = action if action in names else names[0]
+            batch = tuple(observations[pixels].shape[:-3]) if pixels in leaves else None
+            found.append(("n_actions", _count_actions(name, actions[name], batch)))
     return found
+
+
+def _count_actions(name: NestedKey, spec: Any, batch: tuple[int, ...] | None) -> int:
+    """Return of how many actions an environment takes one at a time; ``batch`` is its images'."""
+    count: int | None = None
+    if isinstance(spec, (Categorical, OneHot)) and not hasattr(spec, "nvec"):
+        count = int(spec.space.n)
+    elif isinstance(spec, Bounded) and not spec.dtype.is_floating_point:
+        count = _count(spec) if bool((spec.space.low == 0).all()) else None
+    shape = tuple(spec.shape[:-1] if isinstance(spec, OneHot) else spec.shape)
+    if count is None or batch not in (None, shape):
+        raise UserError(
+            f"networks here choose one of a number of actions for each image, and {name!r} is "
+            f"{type(spec).__name__} of shape {list(spec.shape)}: make the environment with one "
+            "discrete action, 0 to n - 1"
+        )
+    return count
 
 
 def _count(spec: Any) -> int | None:

@@ -12,7 +12,7 @@ from torch.distributions import Categorical
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import set_lenient, take_charge
+from ifo_grounding.modules import charges, set_lenient, take_charge
 from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
 
 CONFIDENCE = 4
@@ -56,7 +56,6 @@ class ImitationLoss(SupervisedLoss):
         """The labelled action, integer [*B]."""
 
     default_keys: Any = _AcceptedKeys
-    out_keys = ["loss_imitation", "accuracy", "entropy"]  # noqa: RUF012
 
     def __init__(
         self,
@@ -73,6 +72,13 @@ class ImitationLoss(SupervisedLoss):
         self.strict_from = strict_from
         self.strict: bool | None = None  # nobody knows how an earlier loss left the network
         self.set_progress(0.0)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """What is written, ``loss_words`` while a network learns that reads word by word."""
+        charged = self.training and charges(self.network)
+        words = ["loss_words"] if charged else []
+        return ["loss_imitation", *words, "accuracy", "entropy"]
 
     def set_progress(self, fraction: float) -> None:
         """Say which share of training is done."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -143,14 +144,23 @@ class InstructionLoss(SupervisedLoss):
         removed, the negatives are taken for what they are, a mixture that holds suitable pairs. One
         instruction of the pool at least suits the scene of a demonstration, its own.
 
+        The loss itself never reads them: training goes on from logits as they were learned.
+
         Raises:
-            UserError: where the share is unknown, for the removal rate was given.
+            UserError: where the share is unknown, for the removal rate was given, or the network
+                has no ``expect`` to be told it by, as those of ``make_instruction_classifier`` do.
         """
+        expect = getattr(self.network.module, "expect", None)
+        if expect is None:
+            raise UserError(
+                f"{type(self.network.module).__name__} has no method expect(share, mixed), which "
+                "shifts its logits: see networks.PairScorer.expect"
+            )
         self.negatives.heed()  # what a checkpoint brought back
         share = max(self.negatives.suitable_share(), 1 / len(self.negatives.pool))
         kept = self.unlabelled == "removal" and not self.negatives.share
         mixed = kept or self.unlabelled == "mixture"
-        self.network.module.expect(share, mixed)
+        expect(share, mixed)
         return share
 
     def _extra_keys(self) -> list[NestedKey]:
@@ -162,7 +172,8 @@ class InstructionLoss(SupervisedLoss):
         self._require(tensordict)
         batch = flat(tensordict, self.network.in_keys)
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
-        with self._mode():
+        as_learned = getattr(self.network.module, "as_learned", contextlib.nullcontext)
+        with self._mode(), as_learned():
             own, other = pair_scores(self.network, batch, others)
             if self.states is not None:
                 other = torch.cat([other, self._elsewhere(batch)], 1)

@@ -84,7 +84,16 @@ class NegativeInstructions(nn.Module):
         self.progress = 1.0
 
     def draw(self, instruction: Tensor, count: int) -> Tensor:
-        """Draw ``count`` instructions per row of [N, L], other than the row's own: [N, K, L]."""
+        """Draw ``count`` instructions per row of [N, L], other than the row's own: [N, K, L].
+
+        Raises:
+            UserError: where instructions have another length than those of the pool.
+        """
+        if instruction.shape[-1] != self.pool.shape[1]:
+            raise UserError(
+                f"instructions have {instruction.shape[-1]} tokens, and those of the pool "
+                f"{self.pool.shape[1]}: encode both with one vocabulary"
+            )
         uniform = self.uniform(count)
         drawn = self._among_all(instruction, uniform)
         if uniform == count:

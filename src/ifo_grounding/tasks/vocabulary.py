@@ -32,7 +32,7 @@ class Vocabulary:
         self._ids = {word: number for number, word in enumerate(self.words, start=1)}
         if len(self._ids) != len(self.words):
             raise UserError("a vocabulary must not hold a word twice")
-        if bad := [word for word in self.words if not word or word != word.strip().lower()]:
+        if bad := [word for word in self.words if word.lower().split() != [word]]:
             raise UserError(f"words must be lower case without spaces, got {bad[0]!r}")
 
     @classmethod

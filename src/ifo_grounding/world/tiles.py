@@ -159,7 +159,8 @@ class Canvas:
             found = _tiles_at(state, places)
             new = found.ne(before.index_select(0, places)).nonzero().squeeze(-1)
             changed, tiles = places.index_select(0, new), found.index_select(0, new)
-            index = shown.put_(changed, tiles)
+            before.scatter_(0, changed, tiles)
+            index = shown
         if MOST_CHANGED * len(changed) > len(before):
             return False
         self._shown = index
