@@ -159,7 +159,7 @@ class Canvas:
             found = _tiles_at(state, places)
             new = found.ne(before.index_select(0, places)).nonzero().squeeze(-1)
             changed, tiles = places.index_select(0, new), found.index_select(0, new)
-            before.scatter_(0, changed, tiles)
+            mosaic.put(before, changed, tiles)
             index = shown
         if MOST_CHANGED * len(changed) > len(before):
             return False
