@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import operator
 from collections.abc import Iterable, Iterator
 
 
@@ -22,6 +23,22 @@ def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     if value not in options:
         listed = ", ".join(repr(option) for option in options)
         raise UserError(f"unknown {name} {value!r}: choose one of {listed}")
+
+
+def whole(name: str, value: object) -> int:
+    """Return a whole number, or refuse what is none.
+
+    >>> whole("n", 1e3)
+    Traceback (most recent call last):
+    ifo_grounding.errors.UserError: n must be a whole number, got 1000.0
+    """
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        raise UserError(f"{name} must be a whole number, got {value!r}")
+    return number
 
 
 def did_you_mean(given: str, allowed: Iterable[str]) -> str:

@@ -15,6 +15,9 @@ from typing import Any
 
 from ifo_grounding.errors import UserError
 
+WRITERS = 20
+"""How often a folder is tried to be replaced that others replace, too."""
+
 
 def home() -> Path:
     """Folder of runs and data: ``$IFO_GROUNDING_HOME``, or ``~/.cache/ifo-grounding``."""
@@ -40,15 +43,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         yield temporary
-        if temporary.is_dir() and path.is_dir():
-            retired = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old")
-            try:
-                os.replace(path, retired)
-                os.replace(temporary, path)
-            finally:  # interrupted between the two, the old one comes back
-                if retired.exists() and not path.exists():
-                    os.replace(retired, path)
-            shutil.rmtree(retired)
+        if temporary.is_dir() and not path.is_file():
+            _replace_folder(temporary, path)
         else:
             os.replace(temporary, path)
     finally:
@@ -56,6 +52,26 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             shutil.rmtree(temporary)
         else:
             temporary.unlink(missing_ok=True)
+
+
+def _replace_folder(temporary: Path, path: Path) -> None:
+    """Give a folder the name of another, which goes; of several writers the last one stays."""
+    for patience in range(WRITERS, -1, -1):
+        retired = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old")
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                os.replace(path, retired)
+            os.replace(temporary, path)
+            return
+        except OSError:  # another writer's folder came between the two
+            if not patience or not path.is_dir():
+                raise
+        finally:  # interrupted between the two, the old one comes back
+            if retired.exists() and not path.exists():
+                with contextlib.suppress(OSError):  # another writer's came in the meantime
+                    os.replace(retired, path)
+            if path.exists():
+                shutil.rmtree(retired, ignore_errors=True)
 
 
 def write_json(path: str | Path, content: Any) -> None:
@@ -79,5 +95,5 @@ def read_json(path: str | Path) -> Any:
         return json.loads(Path(path).read_text())
     except FileNotFoundError:
         raise UserError(f"{path} does not exist") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # no JSON, no text, too deep or too long
         raise UserError(f"{path} is not valid JSON ({error}): delete it or restore it") from None

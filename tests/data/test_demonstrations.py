@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from ifo_grounding.data import Demonstrations, FrameCodec
+from ifo_grounding.data import (
+    Demonstrations,
+    FrameCodec,
+    first_frame_buffer,
+    goal_buffer,
+    labelled_buffer,
+    record_demonstrations,
+    to_huggingface,
+    to_minari,
+)
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 from ifo_grounding.world import random_layout, render
@@ -543,3 +552,24 @@ def test_a_generator_may_write_to_its_array_again(close):
     demos = Demonstrations.from_episodes(recorded(), close=close)
     shown = [demos[number]["pixels"][:, 0, 0, 0].tolist() for number in range(4)]
     assert shown == [[number, number + 100, number + 100] for number in range(4)]
+
+
+def test_instructions_are_as_long_as_those_of_the_vocabulary(tmp_path):
+    words, shown = Vocabulary(["go", "up"], length=5), [torch.zeros(3, 3, 8, 8, dtype=torch.uint8)]
+    demos = Demonstrations.from_arrays(shown, torch.tensor([[1, 2, 0]]), vocabulary=words)
+    assert demos.instructions.tolist() == [[1, 2, 0, 0, 0]]
+    demos.save(tmp_path / "kept")
+    assert Demonstrations.load(tmp_path / "kept").vocabulary == words
+    with pytest.raises(UserError, match="instructions have 6 tokens, those of the vocabulary 5"):
+        Demonstrations.from_arrays(shown, torch.ones(1, 6).long(), vocabulary=words)
+
+
+@pytest.mark.parametrize("make", [first_frame_buffer, goal_buffer, to_huggingface])
+def test_of_no_demonstrations_nothing_is_made(make):
+    none = record_demonstrations("move", 4, seed=0).split(0.1)[1]
+    with pytest.raises(UserError, match="there are no demonstrations: is a selection, or"):
+        make(none)
+    with pytest.raises(UserError, match="there are no demonstrations"):
+        to_minari(none, "mine/none-v0")
+    with pytest.raises(UserError, match="there are no demonstrations"):
+        labelled_buffer(none, torch.zeros(0))

@@ -1,5 +1,6 @@
 import json
 import random
+import struct
 
 import av
 import numpy as np
@@ -9,6 +10,7 @@ from PIL import Image
 
 from comparing import all_frames, assert_same
 from ifo_grounding.data import Demonstrations, load_pictures, save_pictures
+from ifo_grounding.data._video import read_video
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
 
@@ -138,9 +140,12 @@ def test_videos_that_are_cut_short_are_refused(demos, tmp_path):
             video.mux(stream.encode(av.VideoFrame.from_ndarray(noise)))
         video.mux(stream.encode())
     content = path.read_bytes()
+    path.write_bytes(content[:-300])  # a part of the last frame
+    with pytest.raises(UserError, match=r"cut short: it ends at 2\.00 s"):
+        load_pictures(tmp_path / "shown")
     path.write_bytes(content[: len(content) * 2 // 3])
     with pytest.raises(
-        UserError, match=r"^episode '0': .* is cut short: it has . frames and says 9"
+        UserError, match=r"^episode '0': .* is cut short: it ends at 1.00 s and says 2\.25 s"
     ):
         load_pictures(tmp_path / "shown")
 
@@ -343,3 +348,102 @@ def test_pictures_have_no_two_channels(tmp_path):
 def test_arrays_with_the_colours_last_are_recognised():
     with pytest.raises(UserError, match=r"episode 0 .*colours last"):
         Demonstrations.from_arrays([np.zeros((3, 16, 24, 3), np.uint8)], ["go"])
+    for small in ((4, 7, 7, 3), (3, 64, 64, 2)):  # such as MiniGrid's own observation
+        with pytest.raises(UserError, match=r"episode 0 .*colours last"):
+            Demonstrations.from_arrays([np.zeros(small, np.uint8)], ["go"])
+
+
+def film(path, frames=20, size=(32, 16), codec="libx264"):
+    """Make a video of plain frames, four a second."""
+    with av.open(path, "w") as video:
+        stream = video.add_stream(codec, rate=4, options={"g": "5", "bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        for number in range(frames):
+            shown = np.full((*size[::-1], 3), 10 * number, np.uint8)
+            shown[: size[1] // 2] = 255
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(shown)))
+        video.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["mkv", "avi", "mov"])
+def test_videos_of_other_kinds_are_whole_or_refused(suffix, tmp_path):
+    path = film(tmp_path / f"a.{suffix}", codec="mpeg4" if suffix == "avi" else "libx264")
+    assert len(list(read_video(path))) == 20
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 2 // 3])
+    with pytest.raises(UserError, match=r"cut short|cannot be read"):
+        list(read_video(path))
+
+
+def test_a_video_may_hold_frames_that_are_not_shown(tmp_path):
+    """Editors that cut without encoding anew keep what comes before, from a whole frame on."""
+    whole, part = film(tmp_path / "whole.mp4"), tmp_path / "part.mp4"
+    with av.open(whole) as source, av.open(part, "w") as target:
+        stream = source.streams.video[0]
+        copy = target.add_stream_from_template(stream)
+        away = round(1.75 / stream.time_base)
+        for packet in source.demux(stream):
+            if packet.dts is not None and packet.pts * stream.time_base >= 1.25:
+                packet.pts, packet.dts, packet.stream = packet.pts - away, packet.dts - away, copy
+                target.mux(packet)
+    with av.open(part) as video:
+        says, shows = video.streams.video[0].frames, len(list(video.decode(video=0)))
+    assert shows < says
+    assert len(list(read_video(part))) == shows
+
+
+def test_pictures_and_videos_come_the_right_way_up(tmp_path):
+    path = film(tmp_path / "a.mp4", frames=3)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"tkhd") + 44  # the matrix by which a player turns the frames
+    content[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 16 << 16, 0, 1 << 30)
+    path.write_bytes(content)
+    turned = np.asarray(next(iter(read_video(path))))
+    assert turned.shape == (32, 16, 3)
+    assert turned[:, 8:].min() > 200 and turned[:, :8].max() < 50  # what was above is on the right
+
+    (tmp_path / "b").mkdir()
+    for number in range(2):
+        shown = Image.new("RGB", (32, 16))
+        shown.paste((255, 255, 255), (0, 0, 32, 8))
+        exif = shown.getexif()
+        exif[0x0112] = 6  # a phone held upright
+        shown.save(tmp_path / "b" / f"{number}.jpg", exif=exif)
+    list_of(tmp_path, ["b"])
+    frames = load_pictures(tmp_path)[0]["pixels"]
+    assert frames.shape[1:] == (3, 32, 16)
+    assert frames[..., 8:].min() > 200 and frames[..., :8].max() < 50
+
+
+def test_a_photo_may_hold_a_preview_and_an_animation_is_no_frame(tmp_path):
+    (tmp_path / "a").mkdir()
+    for number in range(3):
+        shown, preview = Image.new("RGB", (16, 16), (number, 0, 0)), Image.new("RGB", (4, 4))
+        path = tmp_path / "a" / f"{number}.jpg"
+        shown.save(path, format="MPO", save_all=True, append_images=[preview])
+    list_of(tmp_path, ["a"])
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [3]
+    shown = [Image.new("RGB", (16, 16), colour) for colour in ("red", "blue")]
+    shown[0].save(tmp_path / "a" / "3.webp", save_all=True, append_images=shown[1:])
+    with pytest.raises(UserError, match=r"episode 'a': 3\.webp holds 2 pictures"):
+        load_pictures(tmp_path)
+
+
+def test_more_kinds_of_pictures_are_frames(tmp_path):
+    write(tmp_path, [("a", "go", [0, 1])])
+    Image.new("RGB", (24, 16), (9, 9, 9)).save(tmp_path / "a" / "2.tiff")
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [3]
+
+
+def test_what_stays_the_same_for_long_is_no_gif(tmp_path):
+    still = Demonstrations.from_arrays([np.zeros((3000, 3, 8, 8), np.uint8)], ["stay"])
+    with pytest.raises(UserError, match="episode '0' stays the same for longer than a GIF can say"):
+        save_pictures(still, tmp_path / "shown", kind="gif")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["png", "gif", "mp4"])
+def test_nothing_makes_no_pictures(kind, demos, tmp_path):
+    with pytest.raises(UserError, match="there are no demonstrations"):
+        save_pictures(demos[:0], tmp_path / "shown", kind=kind)

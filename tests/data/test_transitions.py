@@ -10,7 +10,14 @@ import torch
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
-from ifo_grounding.data import Collected, Demonstrations, RandomActions, collect_transitions
+from ifo_grounding.data import (
+    Collected,
+    Demonstrations,
+    RandomActions,
+    collect_transitions,
+    record_demonstrations,
+    transitions,
+)
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.world import Layout
@@ -193,6 +200,20 @@ def test_folders_of_others_are_left_alone(tmp_path):
         found.save(tmp_path / "mine")
     with pytest.raises(UserError, match="is a file: name a folder"):
         found.save(tmp_path / "mine" / "thesis.tex")
+    for others in ("my_actions.npy", "meta.json"):
+        folder = tmp_path / others.partition(".")[0]
+        demos = record_demonstrations("move", 2, seed=0)
+        if others.endswith("npy"):
+            demos.save(folder)
+        else:
+            folder.mkdir()
+        (folder / others).write_text("[1, 2]")
+        with pytest.raises(UserError, match=f"holds '{others}', which would be deleted"):
+            demos.save(folder)
+        assert (folder / others).read_text() == "[1, 2]"
+    demos.save(tmp_path / "theirs")
+    with pytest.raises(UserError, match=r"theirs holds 'codes\.npy', which would be deleted"):
+        found.save(tmp_path / "theirs")
     link = tmp_path / "link"
     link.symlink_to(tmp_path / "made")
     (tmp_path / "made").mkdir()
@@ -221,3 +242,25 @@ def test_who_does_not_say_which_action_is_the_stop_is_asked():
     assert torch.equal(every.kept, every.taken)
     report = collect_transitions(silent, 40, stop_action=STOP).report
     assert report.kept[STOP] == report.taken[STOP]
+
+
+def test_counts_are_whole_numbers():
+    with pytest.raises(UserError, match=r"n must be a whole number, got 1000\.0"):
+        collect_transitions(make_env(), 1e3)
+    with pytest.raises(UserError, match=r"number of demonstrations must be a whole number"):
+        record_demonstrations("move", 1e2)
+
+
+@pytest.mark.parametrize("name", ["action", "taken", "pixels"])
+@pytest.mark.parametrize("change", [lambda x: x.float(), lambda x: x.flatten()[0]])
+def test_arrays_of_another_kind_are_damaged(name, change, tmp_path, monkeypatch):
+    collect_transitions(make_env(), 60).save(tmp_path / "found")
+    load = transitions.load_folder
+
+    def other(*args):
+        arrays, facts = load(*args)
+        return {**arrays, name: change(arrays[name])}, facts
+
+    monkeypatch.setattr(transitions, "load_folder", other)
+    with pytest.raises(UserError, match="found is damaged"):
+        Collected.load(tmp_path / "found")

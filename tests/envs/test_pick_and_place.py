@@ -577,3 +577,39 @@ def test_many_worlds_run_with_deterministic_algorithms():
     env = PickAndPlaceEnv("pick", num_envs=300, seed=0)
     rollout = env.rollout(8, break_when_any_done=False)
     assert torch.equal(rollout["next", "pixels"][:, -1], env.simulator.pixels(tile_size=8))
+
+
+def test_scene_numbers_that_were_read_stay_what_they_were():
+    env = PickAndPlaceEnv("move", num_envs=2, seed=0)
+    env.reset()
+    noted = env.scene_numbers
+    env.reset()
+    assert noted.tolist() == [0, 1]
+
+
+def test_scene_numbers_are_any_whole_numbers():
+    env = PickAndPlaceEnv("move", num_envs=2, seed=0)
+    env.reset()
+    asked = torch.tensor([[5], [6]])
+    with pytest.raises(UserError, match=r"asked for by integers, got torch\.float32"):
+        env.reset(TensorDict({"scene": asked.float()}, [2]))
+    assert env.scene_numbers.tolist() == [0, 1]
+    first = env.reset(TensorDict({"scene": asked.int()}, [2]))
+    assert env.scene_numbers.tolist() == [5, 6]
+    assert (env.reset(TensorDict({"scene": asked}, [2])) == first).all()
+
+
+def test_who_steps_before_a_reset_is_told():
+    env = PickAndPlaceEnv("move", num_envs=2, seed=0)
+    with pytest.raises(UserError, match="reset the environment first"):
+        env.step(TensorDict({"action": torch.zeros(2).long()}, [2]))
+    with pytest.raises(UserError, match="reset the environment first"):
+        env.render()
+
+
+def test_rewards_are_float32_whatever_the_default():
+    torch.set_default_dtype(torch.float64)
+    try:
+        check_env_specs(PickAndPlaceEnv("move", num_envs=2, seed=0))
+    finally:
+        torch.set_default_dtype(torch.float32)

@@ -360,3 +360,41 @@ def test_success_is_measured_in_the_stream_that_is_asked_for():
     assert env.stream == "training"
     with pytest.raises(UserError, match="stream"):
         success_rate(policy, env, episodes=8, stream="test")
+
+
+def test_who_steps_before_a_reset_is_told():
+    with pytest.raises(UserError, match="reset the environment first"):
+        dials(2).step(TensorDict({"action": torch.zeros(2).long()}, [2]))
+
+
+def test_scene_numbers_that_were_read_stay_what_they_were():
+    env = dials(2)
+    env.reset()
+    noted = env.scene_numbers
+    env.reset()
+    assert noted.tolist() == [0, 1]
+
+
+def test_episodes_that_begin_in_inference_mode_go_on_outside():
+    with torch.inference_mode():
+        env = dials(3)
+        env.rollout(5, break_when_any_done=False)
+    assert env.rollout(20, break_when_any_done=False).shape == (3, 20)
+
+
+def test_a_world_that_is_refused_is_closed():
+    opened = []
+
+    class Kept(Dial):
+        closed = False
+
+        def __init__(self):
+            super().__init__()
+            opened.append(self)
+
+        def close(self):
+            self.closed = True
+
+    with pytest.raises(UserError, match="stop must be an action"):
+        from_gymnasium(Kept, seed=0, stop=77, **DIAL)
+    assert opened and all(world.closed for world in opened)

@@ -58,3 +58,10 @@ def test_bad_sentences_are_refused(sentence, said):
 def test_bad_vocabularies_are_refused(words, said):
     with pytest.raises(UserError, match=said):
         Vocabulary(words)
+
+
+def test_a_letter_and_its_accent_are_one_word_however_they_are_written():
+    composed, apart = "caf\u00e9", "cafe\u0301"
+    vocabulary = Vocabulary.from_sentences([composed, apart], length=2)
+    assert vocabulary.words == (composed,) == Vocabulary([apart], 2).words
+    assert vocabulary.encode([composed, apart]).tolist() == [[1, 0], [1, 0]]

@@ -44,6 +44,12 @@ def check_parts(
             )
 
 
+def refuse_empty(count: int, things: str = "demonstrations") -> None:
+    """Raise :class:`UserError` where there is nothing to make something of."""
+    if not count:
+        raise UserError(f"there are no {things}: is a selection, or the share of a split, empty?")
+
+
 def row_numbers(starts: Tensor, lengths: Tensor, padded: Tensor | None = None) -> Tensor:
     """Return frame numbers of episodes in a row, the last one repeated up to ``padded`` lengths."""
     padded = lengths if padded is None else padded

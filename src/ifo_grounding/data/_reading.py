@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 from torch import Tensor
 
 from ifo_grounding.errors import UserError
@@ -20,8 +20,9 @@ COLOURS = (1, 3)
 MODES = {1: "L", 3: "RGB", 4: "RGBA"}
 """Modes of Pillow by channels."""
 LAST = tuple(MODES)
-LEAST_SIDE = 8
+LEAST_SIDE = 5
 """Arrays whose last axis alone is shorter than this are taken for images with colours last."""
+ORIENTATION = ExifTags.Base.Orientation
 NOT_BYTES = ("F", "I", "I;16", "I;16L", "I;16B", "I;16N")
 """Modes of Pillow whose values are not bytes: turned into bytes, most become black or white."""
 
@@ -153,7 +154,7 @@ def check_frames(name: Name, given: Tensor | np.ndarray) -> Tensor:
             f"is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at least one frame; C is "
             "1 for grey, 3 for colours, 4 with alpha"
         )
-    elif shape[1] not in LAST and shape[-1] in LAST and min(shape[1:3]) >= LEAST_SIDE:
+    elif shape[-1] < LEAST_SIDE <= min(shape[1:3]):
         wrong = (
             f"has images {shape[1:]}, with the colours last: give [T + 1, C, H, W], such as "
             "frames.transpose(0, 3, 1, 2)"
@@ -182,6 +183,8 @@ def stack_pictures(
                 "bits per colour"
             )
         try:
+            if picture.getexif().get(ORIENTATION, 1) != 1:
+                picture = ImageOps.exif_transpose(picture)  # as it is shown
             shown = np.asarray(picture.convert(MODES[channels]))
         except BROKEN as error:
             raise UserError(f"episode {name!r}: {place} cannot be read ({error})") from None

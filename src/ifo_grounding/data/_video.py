@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -15,24 +16,50 @@ CODEC = "libx264"
 
 
 def read_video(path: Path) -> Iterator[Image.Image]:
-    """Yield the frames of a video.
+    """Yield the frames of a video as a player shows them, the right way up.
 
     Raises:
-        UserError: where it cannot be read, or holds fewer frames than it says.
+        UserError: where it cannot be read, or ends before it says.
     """
-    iio, av = _libraries()
-    read = 0
+    _, av = _libraries()
+    whole, end = 0, 0.0
     try:
-        with iio.imopen(path, "r", plugin="pyav") as video:
-            expected = video.properties().n_images
-            for frame in video.iter():
-                read += 1
-                yield Image.fromarray(frame)
+        with av.open(str(path)) as video:
+            if not video.streams.video:
+                raise UserError(f"{path} cannot be read (it shows nothing: is it cut short?)")
+            stream = video.streams.video[0]
+            for packet in video.demux(stream):
+                if packet.size and packet.pts is not None and not packet.is_corrupt:
+                    whole += 1
+                    end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+                for frame in packet.decode():
+                    yield Image.fromarray(_upright(frame))
+            expected, seconds, rate = stream.frames, _seconds(video, stream), stream.average_rate
     except (OSError, av.FFmpegError) as error:
         raise UserError(f"{path} cannot be read ({error})") from None
-    # Some formats do not say how many frames they hold: then it is 0.
-    if read < expected:
-        raise UserError(f"{path} is cut short: it has {read} frames and says {expected}")
+    # Where an editor left frames that are not shown, time is right and the count is not.
+    if seconds and rate and end + 0.5 / rate < seconds:
+        raise UserError(f"{path} is cut short: it ends at {end:.2f} s and says {seconds:.2f} s")
+    if not seconds and whole < expected:
+        raise UserError(f"{path} is cut short: it has {whole} frames and says {expected}")
+
+
+def _upright(frame: Any) -> np.ndarray:
+    """Return the pixels of a frame, uint8 [H, W, 3], turned as its display matrix says."""
+    pixels: np.ndarray = frame.to_ndarray(format="rgb24")
+    return np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))
+
+
+def _seconds(video: Any, stream: Any) -> float:
+    """Return when the frames of a video end, as far as it says so itself, else 0."""
+    if stream.duration:
+        return float(stream.duration * stream.time_base)
+    tagged = stream.metadata.get("DURATION", "")
+    if tagged.count(":") == 2:
+        hours, minutes, seconds = tagged.split(":")
+        return 3600 * int(hours) + 60 * int(minutes) + float(seconds)
+    alone = len(video.streams) == 1 and video.duration
+    return video.duration / 1e6 if alone else 0.0
 
 
 def write_video(path: Path, frames: np.ndarray, fps: float) -> None:

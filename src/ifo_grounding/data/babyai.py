@@ -20,7 +20,7 @@ from tqdm import tqdm
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.wrapping import world_seed
-from ifo_grounding.errors import UserError, check_choice, extra
+from ifo_grounding.errors import UserError, check_choice, extra, whole
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -173,7 +173,7 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
     Raises:
         UserError: where minigrid is missing, there is no such level, or the bot fails too often.
     """
-    if n < 1 or processes < 1:
+    if whole("n", n) < 1 or whole("processes", processes) < 1:
         raise UserError(f"n and processes must be at least 1, got {n} and {processes}")
     play = functools.partial(_play, babyai(level, tile_size))
     name = f"{level} {stream}"

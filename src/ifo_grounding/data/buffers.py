@@ -11,6 +11,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose
 
 from ifo_grounding import keys
+from ifo_grounding.data._episodes import refuse_empty
 from ifo_grounding.data._spool import same_rows
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
@@ -86,7 +87,12 @@ def frame_buffer(
             ``instruction``, and whatever else.
         frame_keys: which entries are frames.
         options: for ``TensorDictReplayBuffer``.
+
+    Raises:
+        UserError: where there is no demonstration, or no entry.
     """
+    refuse_empty(len(demos))
+    refuse_empty(len(stored[keys.INSTRUCTION]), "transitions")
     entries = TensorDict(stored, [len(stored[keys.INSTRUCTION])])
     for key in [*frame_keys, keys.INSTRUCTION]:
         entries[key] = entries[key].int()

@@ -10,15 +10,16 @@ from typing import Any, overload
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
 from ifo_grounding import keys
-from ifo_grounding.data._episodes import check_parts, distinct_rows, row_numbers
+from ifo_grounding.data._episodes import check_parts, distinct_rows, refuse_empty, row_numbers
 from ifo_grounding.data._reading import Episode, Reader
 from ifo_grounding.data._spool import same_rows, take
 from ifo_grounding.data.codec import FrameCodec
-from ifo_grounding.data.folder import fact, load_folder, save_folder
+from ifo_grounding.data.folder import DAMAGED, fact, load_folder, save_folder
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import generator as seeded
 from ifo_grounding.tasks.vocabulary import Vocabulary
@@ -40,7 +41,7 @@ class Demonstrations:
         codes: codes of all frames in a row, [F, *codec.code_shape].
         lengths: frames of each episode, at least 1, integer [N]; they add up to F.
         instructions: token ids, integer [N, L], 0 pads.
-        vocabulary: the words of the tokens.
+        vocabulary: the words of the tokens; shorter instructions are padded to its length.
         vocabulary_size: number of token ids, padding included; needed only without vocabulary.
 
     Raises:
@@ -77,6 +78,7 @@ class Demonstrations:
     ) -> None:
         if vocabulary is not None:
             vocabulary_size = len(vocabulary)
+            instructions = _padded(instructions, vocabulary)
         elif vocabulary_size is None:
             vocabulary_size = int(instructions.max()) + 1 if instructions.numel() else 1
         check_parts(codec, codes, lengths, instructions, vocabulary_size)
@@ -337,8 +339,7 @@ class Demonstrations:
             A TensorDict [n, T + 1] of ``pixels``, ``instruction``, ``mask`` (true for real frames);
             shorter episodes are padded with their last frame.
         """
-        if not len(self):
-            raise UserError("there are no demonstrations to sample from")
+        refuse_empty(len(self))
         episode = torch.randint(len(self), (n,), generator=generator)
         lengths = self._lengths[episode].unsqueeze(1)
         time = torch.arange(int(lengths.max()) if n else 0)
@@ -394,5 +395,16 @@ class Demonstrations:
                 vocabulary=vocabulary,
                 vocabulary_size=fact(facts, "vocabulary_size", int),
             )
-        except (ValueError, TypeError, AttributeError) as error:
+        except DAMAGED as error:
             raise UserError(f"{folder} is damaged: {error}") from None
+
+
+def _padded(instructions: Tensor, vocabulary: Vocabulary) -> Tensor:
+    """Return instructions as long as those that a vocabulary makes."""
+    missing = vocabulary.length - instructions.shape[-1] if instructions.ndim == 2 else 0
+    if missing < 0:
+        raise UserError(
+            f"instructions have {instructions.shape[-1]} tokens, those of the vocabulary "
+            f"{vocabulary.length}: make it with length={instructions.shape[-1]}"
+        )
+    return F.pad(instructions, (0, missing)) if missing else instructions

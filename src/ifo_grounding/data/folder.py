@@ -17,6 +17,8 @@ from ifo_grounding.files import atomic_write, read_json, write_json
 
 META = "meta.json"
 BLOCK_BYTES = 1 << 20
+DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError)
+"""What arrays raise that are not what a reader takes them for, NotImplementedError among them."""
 
 
 def save_folder(
@@ -36,9 +38,10 @@ def save_folder(
         facts: what else a reader needs.
 
     Raises:
-        UserError: where the folder is a file, or holds what was not written by this function.
+        UserError: where the folder is a file, or holds what this function did not write, or of
+            another kind.
     """
-    _check_ours(Path(folder))
+    _check_ours(Path(folder), kind)
     with atomic_write(folder) as temporary:
         temporary.mkdir()
         listed = {}
@@ -57,14 +60,21 @@ def save_folder(
         )
 
 
-def _check_ours(folder: Path) -> None:
+def _check_ours(folder: Path, kind: str) -> None:
     """Raise :class:`UserError` where writing ``folder`` would delete what others put there."""
     if not folder.is_dir():
         if folder.exists():
             raise UserError(f"{folder} is a file: name a folder")
         return
-    others = sorted(p.name for p in folder.iterdir() if p.name != META and p.suffix != ".npy")
-    if others:
+    try:
+        found = sorted(path.name for path in folder.iterdir())
+        meta = read_json(folder / META) if META in found else None
+    except FileNotFoundError:  # another writer has just put it away
+        return
+    ours = isinstance(meta, dict) and meta.get("format") == kind
+    arrays = meta.get("arrays") if isinstance(meta, dict) and ours else None
+    listed = {f"{name}.npy" for name in arrays} if isinstance(arrays, dict) else set()
+    if others := [name for name in found if name not in listed and not (ours and name == META)]:
         raise UserError(
             f"{folder} holds {others[0]!r}, which would be deleted: name another folder, or an "
             "empty one"
@@ -111,7 +121,11 @@ def load_folder(
         raise UserError(f"{folder / META} does not list {', '.join(missing)}: it is damaged")
     if foreign := sorted(set(listed) - set(names) - set(optional)):
         raise UserError(f"{folder} holds {', '.join(foreign)}, which {kind} have no place for")
-    return {name: _load_array(folder / f"{name}.npy", listed[name]) for name in listed}, facts
+    try:
+        arrays = {name: _load_array(folder / f"{name}.npy", listed[name]) for name in listed}
+    except FileNotFoundError:
+        raise UserError(f"{folder} was replaced while it was read: read it again") from None
+    return arrays, facts
 
 
 def _save_array(path: Path, tensor: Tensor) -> None:

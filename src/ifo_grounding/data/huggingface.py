@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from ifo_grounding.data._episodes import refuse_empty
 from ifo_grounding.data._reading import Episode, stack_pictures
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import check_colours, rgb
@@ -166,10 +167,12 @@ def to_huggingface(
         cache_dir: where rows are written; by default the cache of ``datasets``.
 
     Raises:
-        UserError: where ``datasets`` is missing, there is no vocabulary, or frames are no pictures.
+        UserError: where ``datasets`` is missing, there is no demonstration or no vocabulary, or
+            frames are no pictures.
     """
     with extra("datasets", "this needs datasets"):
         import datasets
+    refuse_empty(len(demos))
     sentences = demos.sentences()
     check_colours(demos)
 

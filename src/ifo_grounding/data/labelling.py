@@ -84,6 +84,8 @@ class LabelReport:
         arrays, facts = load_folder(folder, KIND, VERSION, ("actions", "confidence"))
         n_actions = fact(facts, "n_actions", int)
         actions, confidence = arrays["actions"], arrays["confidence"]
+        if actions.is_floating_point() or not confidence.is_floating_point():
+            raise UserError(f"{folder} is damaged: actions are whole numbers, confidences are not")
         if actions.shape != confidence.shape or actions.ndim != 1:
             raise UserError(f"{folder} is damaged: actions and confidence are not of one length")
         if len(actions) and not 0 <= int(actions.min()) <= int(actions.max()) < n_actions:

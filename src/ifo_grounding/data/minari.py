@@ -16,6 +16,7 @@ from gymnasium import spaces
 from PIL import Image
 from tqdm import tqdm
 
+from ifo_grounding.data._episodes import refuse_empty
 from ifo_grounding.data._reading import LAST, Episode
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import check_colours, rgb
@@ -184,14 +185,15 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
         details: for ``minari.create_dataset_from_buffers``, such as ``author``.
 
     Raises:
-        UserError: where Minari is missing, the id is none or taken, there is no vocabulary, or
-            frames are no pictures.
+        UserError: where Minari is missing, the id is none or taken, there is no demonstration or
+            no vocabulary, or frames are no pictures.
     """
     minari = _minari()
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.dataset.minari_storage import MinariStorage
     from minari.storage.datasets_root_dir import get_dataset_path
 
+    refuse_empty(len(demos))
     sentences = demos.sentences()
     check_colours(demos)
     try:

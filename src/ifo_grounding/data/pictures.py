@@ -16,6 +16,7 @@ from PIL import Image, ImageSequence
 from torch import Tensor
 from tqdm import tqdm
 
+from ifo_grounding.data._episodes import refuse_empty
 from ifo_grounding.data._reading import BROKEN, COLOURS, LAST, MODES, naming, stack_pictures
 from ifo_grounding.data._video import read_video, write_video
 from ifo_grounding.data.demonstrations import Demonstrations
@@ -27,7 +28,20 @@ LIST = "episodes.jsonl"
 FORMATS = ("png", "gif", "mp4")
 VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm"}
 ANIMATED = (".gif", *sorted(VIDEOS))
-FILES = {".png", ".jpg", ".jpeg", ".bmp", ".webp"}
+FILES = {
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jfif",
+    ".bmp",
+    ".webp",
+    ".tif",
+    ".tiff",
+    ".ppm",
+    ".pgm",
+    ".tga",
+}
 MILLISECONDS = 250
 COMMENT = b"ifo-grounding: a frame lasts %d ms"
 """Kept in a GIF, where Pillow writes equal frames in a row as one that lasts longer."""
@@ -176,17 +190,31 @@ def _pictures(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
     for path in paths:
         try:
             with Image.open(path) as opened:
+                if episode.path.is_dir():
+                    _check_single(episode.name, path, opened)
+                    yield path.name, opened
+                    continue
                 lasts = None
                 if opened.format == "GIF":
                     _check_gif(path.read_bytes())
                     lasts = _lasts(opened)
                 for number, frame in enumerate(ImageSequence.Iterator(opened)):
-                    name = path.name if episode.path.is_dir() else f"{path.name}, frame {number}"
+                    name = f"{path.name}, frame {number}"
                     times = round(frame.info.get("duration", 0) / lasts) if lasts else 1
                     for _ in range(max(1, times)):
                         yield name, frame
         except BROKEN as error:
             raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
+
+
+def _check_single(name: str, path: Path, picture: Image.Image) -> None:
+    """Refuse an animation where a frame should be. A photo may hold others, such as a preview."""
+    count = getattr(picture, "n_frames", 1)
+    if count > 1 and picture.format != "MPO":
+        raise UserError(
+            f"episode {name!r}: {path.name} holds {count} pictures, and each file of a folder is "
+            "one frame: save them one by one, or name the file itself as the frames"
+        )
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
@@ -268,12 +296,13 @@ def save_pictures(
         scale: by which every pixel is enlarged.
 
     Raises:
-        UserError: where the folder holds something, there is no vocabulary, the kind is unknown, or
-            images do not fit it.
+        UserError: where the folder holds something, there is no demonstration or no vocabulary, the
+            kind is unknown, or images do not fit it.
     """
     check_choice("kind", kind, FORMATS)
     if scale < 1:
         raise UserError(f"scale must be at least 1, got {scale}")
+    refuse_empty(len(demos))
     folder = Path(folder)
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise UserError(
@@ -294,19 +323,29 @@ def save_pictures(
                 continue
             pictures = [Image.fromarray(frame) for frame in frames]
             if kind == "gif":
-                pictures[0].save(
-                    temporary / f"{name}.gif",
-                    save_all=True,
-                    append_images=pictures[1:],
-                    duration=MILLISECONDS,
-                    comment=COMMENT % MILLISECONDS,
-                    loop=0,
-                )
+                _save_gif(temporary / f"{name}.gif", pictures)
                 continue
             (temporary / name).mkdir()
             for step, picture in enumerate(pictures):
                 picture.save(temporary / name / f"{step:04d}.png")
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _save_gif(path: Path, pictures: list[Image.Image]) -> None:
+    try:
+        pictures[0].save(
+            path,
+            save_all=True,
+            append_images=pictures[1:],
+            duration=MILLISECONDS,
+            comment=COMMENT % MILLISECONDS,
+            loop=0,
+        )
+    except OverflowError:
+        raise UserError(
+            f"episode {path.stem!r} stays the same for longer than a GIF can say: save it with "
+            "kind='png'"
+        ) from None
 
 
 def check_colours(demos: Demonstrations, allowed: tuple[int, ...] = COLOURS) -> None:

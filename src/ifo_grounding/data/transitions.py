@@ -20,8 +20,8 @@ from ifo_grounding import keys
 from ifo_grounding.attributes import STOP_ACTION, attribute, says_stop
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
-from ifo_grounding.data.folder import fact, load_folder, save_folder
-from ifo_grounding.errors import UserError
+from ifo_grounding.data.folder import DAMAGED, fact, load_folder, save_folder
+from ifo_grounding.errors import UserError, whole
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
@@ -138,11 +138,16 @@ class Collected(NamedTuple):
         codes, after, action = (arrays[name] for name in names[:3])
         try:
             codec = FrameCodec(fact(facts, "image_shape", list), arrays.get("tiles"))
-        except (ValueError, TypeError) as error:
+        except DAMAGED as error:
             raise UserError(f"{folder} is damaged: {error}") from None
+        if any(
+            part.ndim != 1 or part.is_floating_point()
+            for part in (arrays[name] for name in names[2:])
+        ):
+            raise UserError(f"{folder} is damaged: its actions are no rows of whole numbers")
         count = len(codec.tiles) if codec.tiles is not None else 256
         for part in (codes, after):
-            if part.shape != (len(action), *codec.code_shape):
+            if part.shape != (len(action), *codec.code_shape) or part.is_floating_point():
                 raise UserError(f"{folder} is damaged: its arrays do not fit each other")
             if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < count:
                 raise UserError(f"{folder} is damaged: it holds a tile outside its dictionary")
@@ -207,7 +212,7 @@ def collect_transitions(
     >>> int(report.taken.sum()), len(buffer) == int(report.kept.sum())
     (64, True)
     """
-    if n < 1:
+    if whole("n", n) < 1:
         raise UserError(f"n must be at least 1 step, got {n}")
     if drop_unchanged and stop_action is None and not says_stop(env):
         raise UserError(

@@ -43,6 +43,8 @@ class Truth:
     def load(cls, folder: str | Path) -> Truth:
         """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`."""
         arrays, _ = load_folder(folder, KIND, VERSION, ("actions",), FIELDS)
+        if any(array.is_floating_point() for array in arrays.values()):
+            raise UserError(f"{folder} is damaged: actions and goals are whole numbers")
         actions = arrays.pop("actions")
         if not arrays and actions.ndim == 1:
             return cls(actions)

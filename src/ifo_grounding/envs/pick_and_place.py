@@ -141,7 +141,7 @@ class PickAndPlaceEnv(EnvBase):
             self.state_spec = Composite({STATE: self._world_spec()}, shape=batch, device=device)
         self.observation_spec = observation
         self.action_spec = Categorical(keys.N_ACTIONS, shape=batch, device=device)
-        self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
+        self.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
         flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
             {name: flag.clone() for name in DONE},

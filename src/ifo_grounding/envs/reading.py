@@ -8,20 +8,13 @@ import gymnasium
 import numpy as np
 
 from ifo_grounding import keys
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, whole
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 ENDED = "ended"
 """Whether a world has terminated, whether it was truncated, and whether the policy stopped."""
 ADD = "add"
 CHANNELS = (1, 3, 4)
-
-
-def whole(name: str, value: Any) -> int:
-    """Return a whole number, or refuse what is none."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise UserError(f"{name} must be a whole number, got {value!r}")
-    return int(value)
 
 
 class Reading:
@@ -121,6 +114,7 @@ class Read(gymnasium.Wrapper):
         self.stop = count if added else reading.stop
         self.action_space = gymnasium.spaces.Discrete(count + added)
         self._added = count if added else None
+        self._last: dict[str, np.ndarray] | None = None
         observation, info = env.reset(seed=0)
         pixels = reading.pixels(observation)
         self._shape = pixels.shape
@@ -146,6 +140,8 @@ class Read(gymnasium.Wrapper):
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Take an action; the instruction is that of the episode's beginning."""
+        if self._last is None:
+            raise UserError("there is no episode yet: reset the environment first")
         if self._last[ENDED].any():
             return self._last, 0.0, False, False, {}
         stopped = int(action) == self.stop

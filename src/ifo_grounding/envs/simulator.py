@@ -41,6 +41,15 @@ def check_actions(action: Tensor, worlds: int, count: int) -> None:
             )
 
 
+def scene_numbers(numbers: Tensor) -> Tensor:
+    """Return numbers of scenes [N] as int64, or refuse what are none."""
+    if numbers.is_floating_point() or numbers.dtype == torch.bool:
+        raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
+    if len(numbers) and int(numbers.min()) < 0:
+        raise UserError("scene numbers start at 0")
+    return numbers.long()
+
+
 class Simulator:
     """Runs ``num_envs`` episodes of numbered scenes side by side.
 
@@ -132,7 +141,8 @@ class Simulator:
 
     @property
     def _running(self) -> _Episodes:
-        assert self._episodes is not None, "reset first"
+        if self._episodes is None:
+            raise UserError("there is no episode yet: reset the environment first")
         return self._episodes
 
     @torch.inference_mode(False)
@@ -143,7 +153,9 @@ class Simulator:
             rows: which, int64 [R].
             numbers: numbers of the scenes to begin with, int64 [R]; by default the stream's next.
         """
-        if numbers is None:
+        if numbers is not None:
+            numbers = scene_numbers(numbers)
+        else:
             first = self.next_number
             numbers = torch.arange(first, first + len(rows), device=self.device)
             self.next_number += len(rows)
@@ -152,7 +164,7 @@ class Simulator:
         else:
             self.stream.write(numbers, self._episodes.leaves(), rows)
             self._begin(rows)
-        self.numbers[rows] = numbers
+        self.numbers = self.numbers.index_copy(0, rows, numbers)  # others may hold the old ones
 
     @torch.inference_mode(False)
     def place(self, rows: Tensor, scenes: Scene) -> None:
@@ -164,7 +176,7 @@ class Simulator:
         for leaf, new in zip(self._episodes.leaves(), scene_leaves(scenes), strict=True):
             leaf.index_copy_(0, rows, new)
         self._begin(rows)
-        self.numbers[rows] = -1
+        self.numbers = self.numbers.index_fill(0, rows, -1)
 
     def _begin(self, rows: Tensor) -> None:
         self.steps[rows] = 0

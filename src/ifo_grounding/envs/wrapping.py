@@ -17,9 +17,9 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.envs.reading import ADD, ENDED, Read, Reading, whole
-from ifo_grounding.envs.simulator import check_actions
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.envs.reading import ADD, ENDED, Read, Reading
+from ifo_grounding.envs.simulator import check_actions, scene_numbers
+from ifo_grounding.errors import UserError, check_choice, whole
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -115,21 +115,18 @@ def from_gymnasium(
 
 
 def _open(make: Make, reading: Reading) -> Read:
-    return Read(make(), reading)
+    env = make()
+    try:
+        return Read(env, reading)
+    except BaseException:
+        if isinstance(env, gymnasium.Env):
+            env.close()
+        raise
 
 
 def world_seed(seed: int, stream: str, number: int) -> int:
     """Return what a world is seeded with for the scene of a number."""
     return derive(seed, stream, number) % 2**31
-
-
-def _scene_numbers(numbers: Tensor) -> Tensor:
-    """Return numbers of scenes [N] as int64, or refuse what are none."""
-    if numbers.is_floating_point() or numbers.dtype == torch.bool:
-        raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
-    if len(numbers) and int(numbers.min()) < 0:
-        raise UserError("scene numbers start at 0")
-    return numbers.long()
 
 
 class GymnasiumEnv(EnvBase):
@@ -199,7 +196,7 @@ class GymnasiumEnv(EnvBase):
         self.observation_spec = observation
         self.n_actions = int(self.worlds.single_action_space.n)  # type: ignore[attr-defined]
         self.action_spec = Categorical(self.n_actions, shape=batch, device=device)
-        self.reward_spec = Unbounded(shape=(*batch, 1), device=device)
+        self.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
         flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
         self.done_spec = Composite(
             {name: flag.clone() for name in FLAGS}, shape=batch, device=device
@@ -216,9 +213,9 @@ class GymnasiumEnv(EnvBase):
             numbers = (
                 self._next(len(rows))
                 if asked is None
-                else _scene_numbers(asked.reshape(-1).cpu()[rows])
+                else scene_numbers(asked.reshape(-1).cpu()[rows])
             )
-            self._numbers[rows] = numbers
+            self._numbers = self._numbers.index_copy(0, rows, numbers)  # others may hold them
             seeds: list[int | None] = [None] * self.num_envs
             for row in rows.tolist():
                 seeds[row] = world_seed(self._seed, self.stream, int(self._numbers[row]))

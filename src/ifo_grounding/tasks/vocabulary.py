@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable, Sequence
 
 import torch
@@ -27,7 +28,7 @@ class Vocabulary:
     """
 
     def __init__(self, words: Sequence[str], length: int = INSTRUCTION_LENGTH) -> None:
-        self.words = tuple(words)
+        self.words = tuple(map(_composed, words))
         self.length = length
         self._ids = {word: number for number, word in enumerate(self.words, start=1)}
         if len(self._ids) != len(self.words):
@@ -40,7 +41,7 @@ class Vocabulary:
         cls, sentences: Iterable[str], length: int = INSTRUCTION_LENGTH
     ) -> Vocabulary:
         """Collect the distinct words of sentences, in alphabetical order."""
-        return cls(sorted({word for s in sentences for word in s.lower().split()}), length)
+        return cls(sorted({word for s in sentences for word in _words(s)}), length)
 
     def __len__(self) -> int:
         """Count the token ids, padding included."""
@@ -70,7 +71,7 @@ class Vocabulary:
             sentences = [sentences]
         tokens = torch.full((len(sentences), self.length), PAD, dtype=torch.int64)
         for row, sentence in enumerate(sentences):
-            words = sentence.lower().split()
+            words = _words(sentence)
             if skip_unknown:
                 words = [word for word in words if word in self._ids]
             ids = [self._id(word, sentence) for word in words]
@@ -94,6 +95,15 @@ class Vocabulary:
                 + ", ".join(self.words)
             )
         return self._ids[word]
+
+
+def _composed(text: str) -> str:
+    """Write a letter and its accent as one: both ways of writing them are one word."""
+    return unicodedata.normalize("NFC", text)
+
+
+def _words(sentence: str) -> list[str]:
+    return _composed(sentence).lower().split()
 
 
 WORDS = (
