@@ -153,7 +153,7 @@ def recorded(folder: str) -> int:
     Raises:
         UserError: where there is no such folder, or it is damaged.
     """
-    path = Path(folder)
+    path = Path(str(folder))
     if not path.is_dir():
         raise UserError(f"recorded={folder} is no folder of demonstrations")
     return len(read_list(path) if (path / LIST).exists() else Demonstrations.load(path))
@@ -204,7 +204,7 @@ def result_file(
     """Return the small file of what was measured of one run."""
     parts = [task, demonstrations, network, variant]
     name = "-".join(str(part) for part in parts if part)
-    return Path(folder) / f"{name}-seed{seed}.json"
+    return Path(str(folder)) / f"{name}-seed{seed}.json"  # options read digits as a number
 
 
 def starting_policy(run: Run, options: DictConfig, section: str) -> Any:

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, whole
 from ifo_grounding.objectives.pairs import ESTIMATED
 
 AT_LEAST_ONE = (
@@ -65,6 +65,8 @@ def check_values(options: DictConfig) -> None:
             number: Any = OmegaConf.select(options, name)
             if number is None or number == ESTIMATED:
                 continue
+            if names is AT_LEAST_ONE:
+                whole(name, number)
             if isinstance(number, str) or not fits(number):
                 raise UserError(f"{name} must be {allowed}, got {number}")
     check_device(options.device)

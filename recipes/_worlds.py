@@ -55,7 +55,10 @@ class Grid:
             name: tuple(value) if isinstance(value, list) else value
             for name, value in settings.pop("layout").items()
         }
-        return {**settings, "layout": Layout(**layout), **chosen}
+        try:
+            return {**settings, "layout": Layout(**layout), **chosen}
+        except TypeError as error:
+            raise UserError(f"world.layout is {dict(layout)}: {error}") from None
 
     def simulator(self, num_envs: int = 1) -> PickAndPlaceEnv:
         """Return the simulator without instructions and rewards: all that a learner may step."""

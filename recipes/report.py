@@ -13,6 +13,7 @@ from _shared import (
     load_demonstrations,
     load_network,
     open_run,
+    practised_pool,
 )
 from _worlds import World, open_world
 from evaluate import NAMES, PHASES, evaluate, evaluation_scenes
@@ -64,7 +65,7 @@ def report(options: DictConfig, results: dict[str, Any] | None = None) -> Path:
         pictures["Chosen instructions"] = instruction_cases(
             load_network(run, CLASSIFIER, "train_instruction", options),
             world.task,
-            load_demonstrations(run).pool(),
+            practised_pool(run, options),
             threshold=options.instruction.threshold,
             candidates=options.instruction.candidates,
             choose=options.instruction.choose,

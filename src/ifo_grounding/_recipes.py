@@ -53,11 +53,15 @@ def recipe_names() -> list[str]:
 def one_line_errors() -> Iterator[None]:
     """Turn a :class:`UserError` into ``error: ...`` on stderr and exit code 2, without a traceback.
 
+    So it does with what the system refuses: a file that cannot be written, a full disk.
     ``HYDRA_FULL_ERROR=1`` in the environment keeps the traceback.
     """
     try:
         yield
-    except UserError as error:
+    except BrokenPipeError:  # whoever reads what is printed, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(CLOSED) from None
+    except (UserError, OSError) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         print("error:", " ".join(str(error).split()), file=sys.stderr)
@@ -65,9 +69,6 @@ def one_line_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
-    except BrokenPipeError:  # whoever reads what is printed, such as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(CLOSED) from None
 
 
 def recipe_main(function: Callable[[DictConfig], object]) -> Callable[[], None]:
@@ -91,6 +92,7 @@ def recipe_main(function: Callable[[DictConfig], object]) -> Callable[[], None]:
     @functools.wraps(function)
     def job(options: DictConfig) -> None:
         from omegaconf import MissingMandatoryValue
+        from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
         with one_line_errors():
             try:
@@ -99,6 +101,8 @@ def recipe_main(function: Callable[[DictConfig], object]) -> Callable[[], None]:
                 raise UserError(
                     f"option {error.full_key!r} is required: give it a value"
                 ) from error
+            except (ConfigAttributeError, ConfigKeyError) as error:
+                raise UserError(f"option {error.full_key!r} is needed: do not remove it") from error
 
     @functools.wraps(function)
     def main() -> None:
@@ -165,6 +169,8 @@ def _parse_flags(arguments: Sequence[str]) -> Namespace:
 def _check_overrides(name: str, overrides: Sequence[Override], several: bool) -> None:
     from hydra import compose
     from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
 
     loader = GlobalHydra.instance().config_loader()
     groups, values = [], []
@@ -186,6 +192,11 @@ def _check_overrides(name: str, overrides: Sequence[Override], several: bool) ->
     choices = [group for group in loader.list_groups("") if group != "hydra"]
     for override in values:
         _check_value(defaults, override, choices)
+    whole = [each.input_line or "" for each in values if not each.is_sweep_override()]
+    try:
+        compose(name, overrides=[*chosen, *whole])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(str(error)) from None
 
 
 def _check_group(name: str, override: Override) -> None:

@@ -15,6 +15,15 @@ from ifo_grounding.errors import UserError
 STOP_ACTION = "stop_action"
 
 
+def answers(source: Any, name: str) -> list[Any]:
+    """Return what an environment says of itself, or what its workers say; empty where nothing."""
+    try:
+        value = getattr(_answering(source), name, None)
+        return list(value) if isinstance(value, (list, tuple)) else [value]
+    except Exception:  # a closed or remote env may fail in many ways; its specs then speak
+        return []
+
+
 def attribute(source: Any, name: str) -> Any:
     """Return a plain attribute; a vector env that answers per worker must agree with itself.
 
@@ -54,12 +63,17 @@ def _answering(source: Any) -> Any:
     while isinstance(base, TransformedEnv):
         base = base.base_env
     if isinstance(base, ParallelEnv):
-        if base not in _FIRST_WORKERS:
-            _FIRST_WORKERS[base] = base.create_env_fn[0](**base.create_env_kwargs[0])
-        return _FIRST_WORKERS[base]
+        return first_worker(base)
     if isinstance(base, BatchedEnvBase) and base.is_closed:
         base.start()
     return source
+
+
+def first_worker(env: BatchedEnvBase) -> EnvBase:
+    """Return an environment as that of a batch's first worker, made here."""
+    if env not in _FIRST_WORKERS:
+        _FIRST_WORKERS[env] = env.create_env_fn[0](**env.create_env_kwargs[0])
+    return _FIRST_WORKERS[env]
 
 
 _FIRST_WORKERS: MutableMapping[EnvBase, EnvBase] = WeakKeyDictionary()

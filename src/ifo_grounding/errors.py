@@ -6,6 +6,8 @@ import contextlib
 import difflib
 import operator
 from collections.abc import Iterable, Iterator
+from dataclasses import fields
+from typing import Any, SupportsFloat
 
 
 class UserError(ValueError):
@@ -39,6 +41,22 @@ def whole(name: str, value: object) -> int:
     if number is None or isinstance(value, bool):
         raise UserError(f"{name} must be a whole number, got {value!r}")
     return number
+
+
+def check_numbers(config: Any) -> None:
+    """Refuse values of a dataclass that are no numbers where its fields say ``int`` or ``float``.
+
+    Raises:
+        UserError: with the name of the first of them.
+    """
+    for field in fields(config):
+        value = getattr(config, field.name)
+        if field.type == "int" or (field.type == "int | None" and value is not None):
+            whole(field.name, value)
+        elif field.type == "float" and (
+            isinstance(value, bool | str) or not isinstance(value, SupportsFloat) or value != value
+        ):
+            raise UserError(f"{field.name} must be a number, got {value!r}")
 
 
 def did_you_mean(given: str, allowed: Iterable[str]) -> str:

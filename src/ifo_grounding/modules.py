@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 
@@ -44,6 +45,20 @@ def device_of(module: object) -> torch.device | None:
         for tensor in (*module.parameters(), *module.buffers()):
             return tensor.device
     return None
+
+
+def beside(batch: TensorDictBase, module: object) -> TensorDictBase:
+    """Return a batch where a module's weights are: buffers sample on the CPU.
+
+    >>> from tensordict import TensorDict
+    >>> batch = TensorDict({"pixels": torch.zeros(2)}, [2])
+    >>> beside(batch, nn.Linear(1, 1)) is batch
+    True
+    >>> beside(batch, nn.Linear(1, 1, device="meta")).device
+    device(type='meta')
+    """
+    device = device_of(module)
+    return batch if device is None or device.type == "cpu" else batch.to(device)
 
 
 def charges(module: nn.Module) -> bool:

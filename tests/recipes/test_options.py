@@ -27,6 +27,13 @@ STAGES_OF_PHASE_1 = (
         ("instruction.threshold=1.5", "threshold is a probability"),
         ("imitate.batch_size=0", "batch_size"),
         ("world.layout.size=2", "size must be 3..16"),
+        ("world.layout.objects=[a,b]", "objects"),
+        ("self_examine.pairs=2.5", "self_examine.pairs must be a whole number, got 2.5"),
+        ("self_examine.lr=nan", "lr must be a number, got nan"),
+        ("self_examine.lr=inf", "lr and value_lr must be finite"),
+        ("networks.features=2.5", "features must be a whole number"),
+        ("threads=1.5", "threads must be a whole number"),
+        ("self_examine.value_warmup=30", "the policy would never learn"),
     ],
 )
 def test_what_a_later_stage_would_refuse_is_refused_first(
@@ -177,9 +184,22 @@ def test_any_stage_of_a_new_run_may_begin_with_what_another_made(compose, tmp_pa
         ("+imitate.iterations=5", "unknown option 'imitate.iterations'"),
         ("+self_examine.hidden=5", "unknown option 'self_examine.hidden'"),
         ("+imitate.grad_clip=-1.0", "grad_clip must be above 0"),
+        ("+imitate.validate_every=abc", "validate_every must be a whole number, got 'abc'"),
+        ("+imitate.trials=3", "Could not append to config. An item is already at"),
+        ("run=/dev/null/run", "Not a directory"),
+        ("~imitate", "option 'imitate' is needed"),
     ],
 )
 def test_what_nothing_would_read_is_not_added(recipes, capsys, added, said):
     with pytest.raises(SystemExit) as stopped:
         run_recipe("two_phase", ["budget=tiny", added])
     assert stopped.value.code == 2 and said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("preset", ["strong", "film", "paper"])
+def test_the_policy_learns_in_the_smallest_budget_too(compose, preset):
+    section = compose("two_phase", f"preset={preset}", "budget=tiny").self_examine
+    assert section.value_warmup < section.iterations
+    usual = {"strong": 3, "film": 3, "paper": 2}
+    usually = compose("two_phase", f"preset={preset}", "budget=full").self_examine
+    assert usually.value_warmup == usual[preset]

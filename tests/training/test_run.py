@@ -42,6 +42,27 @@ def test_what_is_missing_is_named_with_the_recipe_that_makes_it(tmp_path):
         Run(tmp_path / "run").need("inverse.safetensors", "train_inverse")
 
 
+def test_a_stage_whose_file_is_gone_is_to_be_done_again(tmp_path):
+    run = Run(tmp_path / "run")
+    run.stage("imitate", {}).finish({})
+    (run / "policy").write_text("weights")
+    run.need("policy", "imitate")
+    assert run.stage("imitate", {}).result == {}
+    (run / "policy").unlink()
+    with pytest.raises(UserError, match="run the recipe imitate"):
+        run.need("policy", "imitate")
+    assert run.stage("imitate", {}).result is None
+
+
+def test_a_stage_drops_no_checkpoint_of_one_whose_name_begins_like_its_own(tmp_path):
+    stage = Run(tmp_path / "run").stage("zero-shot", {})
+    for name in ("zero-shot", "zero-shot-3", "zero-shot-jitter", "zero-shot-jitter-0"):
+        Checkpoint(tmp_path / "run" / "checkpoints" / f"{name}.pt", "a").save({})
+    stage.finish({})
+    left = sorted(path.stem for path in (tmp_path / "run" / "checkpoints").iterdir())
+    assert left == ["zero-shot-jitter", "zero-shot-jitter-0"]
+
+
 def test_names_live_under_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path))
     assert Run("mine").folder == tmp_path / "runs" / "mine"

@@ -1,3 +1,4 @@
+import math
 from functools import partial
 
 import pytest
@@ -5,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.objectives.value import GAE
 
 from ifo_grounding import keys
@@ -60,6 +61,12 @@ def nested():
     """Transforms around an environment that has some already."""
     sampled = TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))
     return TransformedEnv(sampled, LearnedReward(likes(1)))
+
+
+def grouped():
+    """A group of transforms in another."""
+    inner = Compose(InstructionSampler(accepts_all(), POOL), LearnedReward(likes(1)))
+    return TransformedEnv(simulator(), Compose(StepCounter(9), inner))
 
 
 def of_pairs():
@@ -144,6 +151,38 @@ def test_divergence_from_phase_1_costs_reward():
     assert held < free - 0.1
 
 
+def test_the_learned_reward_is_told_without_what_divergence_costs():
+    judge = TensorDictModule(
+        lambda pixels, action: torch.rand(*action.shape, 1),
+        [keys.PIXELS, keys.ACTION],
+        [keys.ACTION_SCORE],
+    )
+    history = self_examine(
+        make_env(judge), *make_networks(), config(iterations=4, kl=50.0, lr=3e-3), seed=0
+    )
+    assert min(metrics["learned_reward"] for metrics in history) > 0.5  # a probability
+    assert history[0]["divergence"] == 0 < max(metrics["divergence"] for metrics in history)
+
+
+@pytest.mark.parametrize("options", [{"kl": 1.0}, {"kl": 1.0, "select_every": 1}], ids=str)
+def test_an_interrupted_run_goes_on_with_the_same_objects(tmp_path, options):
+    """As in a notebook: policy and environment are then no longer as they were at first."""
+    chosen = config(iterations=4, lr=3e-3, steps=5, select_episodes=8, max_steps=5, **options)
+    whole = make_networks()
+    expected = self_examine(of_pairs(), *whole, chosen, seed=0)
+    env, networks, path = of_pairs(), make_networks(), tmp_path / "run.pt"
+
+    def interrupt(metrics, step):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        self_examine(env, *networks, chosen, seed=0, checkpoint=path, log=interrupt)
+    assert self_examine(env, *networks, chosen, seed=0, checkpoint=path) == expected
+    for network, other in zip(whole, networks, strict=True):
+        assert all(torch.equal(w, other.state_dict()[n]) for n, w in network.state_dict().items())
+
+
 def test_values_of_some_worlds_at_a_time_are_those_of_all_at_once(monkeypatch):
     learned = []
     for steps in (8, 40, 10_000):  # one world, five, all sixteen
@@ -186,7 +225,7 @@ def test_without_discount_it_learns_what_torchrls_estimator_would_teach_it():
     assert not all(map(torch.equal, learned[0], untrained))
 
 
-@pytest.mark.parametrize("make", [make_env, nested, of_pairs])
+@pytest.mark.parametrize("make", [make_env, nested, grouped, of_pairs])
 def test_a_killed_run_continues_to_the_same_weights(tmp_path, make):
     whole = make_networks()
     expected = self_examine(make(), *whole, config(iterations=3), seed=0)
@@ -268,6 +307,20 @@ def test_worlds_in_workers_are_practised_in(kind):
     assert history[-1]["selection_return"] > 0
 
 
+def test_starts_inside_of_workers_stay_the_scenes_that_they_are():
+    pairs = select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
+
+    def worker(number):
+        mine = pairs[12 * number : 12 * (number + 1)]
+        return lambda: TransformedEnv(simulator(4), StartingPairs(mine, seed=number))
+
+    env = TransformedEnv(SerialEnv(2, [worker(0), worker(1)]), LearnedReward(likes(1)))
+    history = self_examine(env, *make_networks(), config(iterations=3), seed=0)
+    assert len(history) == 3  # a scene that is another one would have been noticed
+    with pytest.raises(UserError, match="set select_every=0 to keep the last one"):
+        self_examine(env, *make_networks(), config(select_every=1), seed=0)
+
+
 def test_no_true_reward_reaches_the_learner():
     """The simulator would pay for success; what is learned from does not even hold that entry."""
     seen = []
@@ -298,6 +351,11 @@ def test_envs_that_leak_or_lack_something_are_refused():
         self_examine(worlds, policy, value, config(), seed=0)
     with pytest.raises(UserError, match="never sees true instructions"):
         self_examine(PickAndPlaceEnv("move", 4, seed=0), policy, value, config(), seed=0)
+    worlds = SerialEnv(2, lambda: PickAndPlaceEnv("move", 4, seed=0))
+    with pytest.raises(UserError, match="never sees true instructions"):
+        self_examine(
+            TransformedEnv(worlds, LearnedReward(likes(1))), policy, value, config(), seed=0
+        )
     with pytest.raises(UserError, match="no instructions"):
         self_examine(simulator(), policy, value, config(), seed=0)
     sampled = TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))
@@ -305,7 +363,14 @@ def test_envs_that_leak_or_lack_something_are_refused():
         self_examine(sampled, policy, value, config(), seed=0)
 
 
-@pytest.mark.parametrize("wrong", [{"algorithm": "dqn"}, {"iterations": 0}, {"minibatch": 0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"algorithm": "dqn"}, {"iterations": 0}, {"minibatch": 0}, {"max_steps": 2.5}),
+        *({"clip": math.nan}, {"select_margin": math.nan}, {"lr": math.inf}, {"lr": "fast"}),
+    ],
+    ids=str,
+)
 def test_impossible_configs_are_refused(wrong):
     with pytest.raises(UserError):
         SelfExaminationConfig(**wrong)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, check_numbers
 
 POOLINGS = ("last", "mean", "both")
 """Which states of a GRU make an encoded sentence."""
@@ -89,6 +89,7 @@ class NetworkConfig:
             raise UserError(f"sizes in head_hidden must be at least 1, got {self.head_hidden}")
 
     def _check_sizes(self) -> None:
+        check_numbers(self)
         by_word = self.matching == "words"
         if by_word and self.preset == "paper":
             raise UserError("matching='words' reads patches: it needs preset 'strong' or 'film'")

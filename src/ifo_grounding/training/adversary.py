@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
+from ifo_grounding.modules import beside
 from ifo_grounding.objectives import RewardLoss
 from ifo_grounding.training.supervised import Metrics, make_optimizer, update
 
@@ -43,9 +44,8 @@ class Adversary:
         totals: dict[str, float] = {}
         for _ in range(self.steps):
             rows = torch.randint(len(policy_steps), (self.batch_size,))
-            losses = self.loss.adversarial(
-                self.demonstrations.sample(self.batch_size), policy_steps[rows], self.smoothing
-            )
+            shown = beside(self.demonstrations.sample(self.batch_size), self.loss)
+            losses = self.loss.adversarial(shown, policy_steps[rows], self.smoothing)
             for key, value in update(losses, self.optimizer, self.grad_clip).items():
                 totals[key] = totals.get(key, 0.0) + float(value) / self.steps
         return {f"reward/{key}": value for key, value in totals.items()}

@@ -7,8 +7,10 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding import keys
+from ifo_grounding.attributes import first_worker
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.supervised import Metrics
@@ -54,8 +56,22 @@ def reseed(env: EnvBase, seed: int) -> None:
     for place, transform in enumerate(transforms):
         if callable(set_seed := getattr(transform, "set_seed", None)):
             set_seed(derive(seed, "transform", place) % 2**31)
-    if not any(getattr(transform, "fixes_scenes", False) for transform in transforms):
+    if not any(map(fixes_scenes, transforms)) and not workers_fix_scenes(env):
         env.set_seed(derive(seed, "simulator") % 2**31)
+
+
+def fixes_scenes(transform: nn.Module) -> bool:
+    """Whether a transform begins episodes in scenes that it knows by their numbers."""
+    return bool(getattr(transform, "fixes_scenes", False))
+
+
+def workers_fix_scenes(env: EnvBase) -> bool:
+    """Whether transforms inside of workers begin episodes in scenes that they know."""
+    base = innermost(env)
+    if not isinstance(base, BatchedEnvBase):
+        return False
+    worker = first_worker(base)
+    return any(map(fixes_scenes, transforms_of(worker))) or workers_fix_scenes(worker)
 
 
 def sampler_stats(env: EnvBase) -> Metrics:
@@ -71,9 +87,13 @@ def transforms_of(env: EnvBase) -> list[nn.Module]:
     """Return the transforms around an env, the innermost first; not those inside of workers."""
     if not isinstance(env, TransformedEnv):
         return []
-    transform = env.transform
-    own = list(transform) if isinstance(transform, Compose) else [transform]
-    return [*transforms_of(env.base_env), *own]
+    return [*transforms_of(env.base_env), *_parts(env.transform)]
+
+
+def _parts(transform: nn.Module) -> list[nn.Module]:
+    if not isinstance(transform, Compose):
+        return [transform]
+    return [part for each in transform for part in _parts(each)]
 
 
 def summary(batch: TensorDictBase) -> Metrics:

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ifo_grounding import keys
 from ifo_grounding.data.buffers import FINAL
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import evaluating
+from ifo_grounding.modules import beside, evaluating
 
 
 class Guard:
@@ -59,7 +59,7 @@ class Guard:
         right, final = [], []
         with evaluating(self.policy), set_exploration_type(ExplorationType.DETERMINISTIC):
             for rows in torch.arange(len(self.buffer)).split(self.batch_size):
-                seen = self.buffer[rows]
+                seen = beside(self.buffer[rows], self.policy)
                 wanted = seen.pop(keys.ACTION)
                 right.append((self.policy(seen)[keys.ACTION] == wanted).float().cpu())
                 final.append(seen[FINAL].squeeze(-1).long().cpu())

@@ -11,6 +11,7 @@ from torch import nn
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.modules import beside
 from ifo_grounding.training.supervised import total_loss
 
 
@@ -57,7 +58,9 @@ class HeldOut:
             torch.manual_seed(0)  # the same negatives at every look
             total = 0.0
             for rows in torch.arange(len(self.buffer)).split(self.batch_size):
-                total += float(total_loss(self.loss(self.buffer[rows]))) * len(rows)
+                total += float(total_loss(self.loss(beside(self.buffer[rows], self.loss)))) * len(
+                    rows
+                )
         self.loss.train(training)
         mean = total / len(self.buffer)
         if mean < self.best_loss:

@@ -57,21 +57,21 @@ class Learner:
         """Roll out the policy from a reset, [N, T], without whatever the simulator judged."""
         if self.batches is None:
             self.batches = iter(self.collector)
-        batch = next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
-        if self.reference is not None:
-            self._charge_divergence(batch)
-        return batch
+        return next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
 
     @torch.no_grad()
-    def _charge_divergence(self, batch: TensorDictBase) -> None:
+    def charge(self, batch: TensorDictBase) -> Metrics:
+        """Let collected steps pay for being away from the phase-1 policy, where that costs."""
+        if self.reference is None:
+            return {}
         steps = batch.reshape(-1)
         parts = steps.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION).split(4096)
-        assert self.reference is not None
         reference = torch.cat([_log_prob(self.reference, part) for part in parts])
         current = torch.cat([_log_prob(self.policy, part) for part in parts])
-        charge = self.config.kl * (current - reference).reshape(*batch.shape, 1)
+        away = (current - reference).reshape(*batch.shape, 1)
         reward = batch[keys.NEXT, keys.LEARNED_REWARD]
-        batch[keys.NEXT, keys.LEARNED_REWARD] = reward - charge
+        batch[keys.NEXT, keys.LEARNED_REWARD] = reward - self.config.kl * away
+        return {"divergence": float(away.mean())}
 
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""

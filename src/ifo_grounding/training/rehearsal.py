@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.modules import beside
 from ifo_grounding.objectives import ImitationLoss
 
 
@@ -39,4 +40,5 @@ class Rehearsal:
 
     def __call__(self) -> Tensor:
         """Return the weighted loss of a batch of demonstrations."""
-        return self.weight * self.loss(self.buffer.sample(self.batch_size))["loss_imitation"]
+        batch = beside(self.buffer.sample(self.batch_size), self.loss)
+        return self.weight * self.loss(batch)["loss_imitation"]

@@ -69,6 +69,8 @@ class Run:
         """
         path = self.folder / name
         if not path.exists():
+            # Its stage may count as done: to run it again has to help.
+            self._record_path(recipe).unlink(missing_ok=True)
             raise UserError(f"{path} is missing: run the recipe {recipe} with the same run first")
         return path
 
@@ -142,9 +144,12 @@ class Stage:
         self._start = time.monotonic() - (sum(map(spent, left)) if self.result is None else 0.0)
 
     def checkpoints(self) -> list[Path]:
-        """Return the checkpoint and those beside it, named after it with a dash."""
+        """Return the checkpoint and those beside it, named after it with a dash and a number."""
         folder, stem = self.checkpoint.parent, self.checkpoint.stem
-        return [self.checkpoint, *sorted(folder.glob(f"{stem}-*.pt"))]
+        beside = (
+            path for path in folder.glob(f"{stem}-*.pt") if path.stem[len(stem) + 1 :].isdigit()
+        )
+        return [self.checkpoint, *sorted(beside)]
 
     def replace(self) -> None:
         """Forget that the stage is done: what was made with other settings is written over now."""

@@ -16,7 +16,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
-from ifo_grounding.training.environment import reseed, sampler_stats, transforms_of
+from ifo_grounding.training.environment import (
+    fixes_scenes,
+    reseed,
+    sampler_stats,
+    transforms_of,
+)
 from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.supervised import Metrics
 
@@ -161,7 +166,7 @@ class Selection:
         self.guard, self.by_agreement = guard, by_agreement
         self.metric = AGREEMENT if by_agreement else "selection_return"
         self.best = BestPolicy(policy, schedule.margin)
-        self.fixed = [t for t in transforms_of(env) if getattr(t, "fixes_scenes", False)]
+        self.fixed = [t for t in transforms_of(env) if fixes_scenes(t)]
         self.first_starts = copy.deepcopy([starts.state_dict() for starts in self.fixed])
 
     def after(self, done: int) -> Metrics:
@@ -213,10 +218,11 @@ class Selection:
     def state_dict(self) -> dict[str, Any]:
         """Return what a checkpoint has to keep."""
         guard = {"guard": self.guard.state_dict()} if self.guard else {}
-        return {**self.best.state_dict(), **guard}
+        return {**self.best.state_dict(), **guard, "first_starts": self.first_starts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
         self.best.load_state_dict(state)
+        self.first_starts = state.get("first_starts", self.first_starts)  # older ones lack them
         if self.guard:
             self.guard.load_state_dict(state["guard"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,18 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torchrl.envs import EnvBase
 
 from ifo_grounding.allocation import release_freed_memory
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, check_numbers
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
 from ifo_grounding.training.environment import (
     check_env,
+    fixes_scenes,
     reseed,
     sampler_stats,
     summary,
     transforms_of,
+    workers_fix_scenes,
 )
 from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.policy_gradient import Learner
@@ -83,7 +86,10 @@ class SelfExaminationConfig:
 
     def __post_init__(self) -> None:
         """Refuse unknown algorithms and empty budgets."""
+        check_numbers(self)
         check_choice("algorithm", self.algorithm, ALGORITHMS)
+        if math.isinf(self.lr) or math.isinf(self.value_lr):
+            raise UserError("lr and value_lr must be finite")
         counts = ("iterations", "steps", "epochs", "minibatch", "select_episodes", "max_steps")
         for name in (*counts, "checkpoint_every"):
             if getattr(self, name) < 1:
@@ -152,9 +158,15 @@ def self_examine(
 
     Raises:
         UserError: where the env exposes its true state, or has no learned reward, or where the best
-            policy is to be selected beside an adversary, without a guard.
+            policy is to be selected beside an adversary, without a guard, or with starts inside of
+            workers.
     """
     check_env(env)
+    if config.select_every and workers_fix_scenes(env):
+        raise UserError(
+            "policies are compared on the same starts, and those inside of workers cannot be gone "
+            "back to: set select_every=0 to keep the last one, or do without workers"
+        )
     by_agreement = adversary is not None and config.select_every > 0
     if by_agreement and guard is None:
         raise UserError(
@@ -173,12 +185,14 @@ def self_examine(
         "optimizer": learner.optimizer,
         "best": selection,
     }
+    if learner.reference is not None:
+        parts["reference"] = learner.reference
     if adversary:
         parts["adversary"] = adversary
     parts |= {
         f"starts {place}": transform
         for place, transform in enumerate(transforms_of(env))
-        if getattr(transform, "fixes_scenes", False)
+        if fixes_scenes(transform)
     }
     identity = fingerprint(config, seed, list(env.batch_size), settings)
     saved = Checkpoint(checkpoint, identity, **parts) if checkpoint else None
@@ -201,6 +215,7 @@ def self_examine(
             batch = learner.collect()
             metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
             metrics |= sampler_stats(env)
+            metrics |= learner.charge(batch)
             metrics |= learner.improve(batch, iteration)
             release_freed_memory()  # batches of distinct pictures differ in size and would pile up
             if adversary:

@@ -15,7 +15,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_numbers
+from ifo_grounding.modules import beside, device_of
 from ifo_grounding.networks.transfer import inherited
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
@@ -71,12 +72,15 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that cannot be."""
+        check_numbers(self)
         for name in ("steps", "batch_size", "iteration", "validate_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("lr", "grad_clip"):
             if not getattr(self, name) > 0:
                 raise UserError(f"{name} must be above 0, got {getattr(self, name)}")
+        if math.isinf(self.lr):
+            raise UserError("lr must be finite")
         for name in ("weight_decay", "prior", "evaluate_every"):
             if not getattr(self, name) >= 0:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
@@ -192,6 +196,8 @@ def fit(
             f"fit samples from a replay buffer, got {type(buffer).__name__}: demonstrations become "
             "one by labelled_buffer(demos, label_demonstrations(demos, inverse).actions)"
         )
+    if (device := device_of(loss)) is not None and device.type != "cpu":
+        loss.to(device)  # with all that it holds beside its network
     decay = config.decay(len(buffer)) if config.prior else config.weight_decay
     optimizer = make_optimizer(loss.parameters(), config.lr, decay)
     if decay:
@@ -247,7 +253,7 @@ def _iterate(
             set_progress(step / config.steps)
         for group in optimizer.param_groups:
             group["lr"] = config.lr * config.rate(step)
-        batch = buffer.sample(config.batch_size)
+        batch = beside(buffer.sample(config.batch_size), loss)
         for key, value in update(loss(batch), optimizer, config.grad_clip).items():
             sums[key] = sums[key] + value.cpu()
     elapsed = time.perf_counter() - start

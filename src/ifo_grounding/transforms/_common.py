@@ -11,6 +11,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
+from ifo_grounding.attributes import answers
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import ACTION_SCORE, GOAL_SCORE, SUITABILITY
 
@@ -141,11 +142,8 @@ def exposes_state(env: EnvBase) -> bool:
 
 
 def instructs(env: EnvBase) -> bool:
-    """Tell whether an environment without transforms brings instructions of its own.
-
-    Workers cannot be asked: transforms in them may bring the instructions.
-    """
-    return not isinstance(env, BatchedEnvBase) and getattr(env, "instructed", False)
+    """Tell whether an environment without transforms, or a worker's, brings instructions."""
+    return any(answers(env, "instructed"))
 
 
 def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:
