@@ -3,12 +3,17 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import Shapes, make_instruction_classifier, make_policy
+from ifo_grounding.networks import (
+    Shapes,
+    make_instruction_classifier,
+    make_policy,
+    make_reward_model,
+)
 from ifo_grounding.networks.transfer import inherited
-from ifo_grounding.objectives import ImitationLoss, InstructionLoss
+from ifo_grounding.objectives import ImitationLoss, InstructionLoss, RewardLoss
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.training.supervised import total_loss
 
@@ -68,6 +73,30 @@ def test_a_run_that_paused_goes_on_to_the_same_weights(buffer, tmp_path):
     assert steps == [9, 12]
     for name, weight in parts.state_dict().items():
         assert torch.equal(weight, whole.state_dict()[name])
+
+
+@pytest.mark.parametrize("drawing", ["loss", "buffer", "rounds"])
+def test_a_run_goes_on_with_generators_and_rounds_of_its_own(buffer, tmp_path, drawing):
+    data = buffer.storage.get(slice(0, 256))
+
+    def parts():
+        own = torch.Generator().manual_seed(3)
+        options = {"generator": own} if drawing == "buffer" else {}
+        if drawing == "rounds":
+            options = {"sampler": SamplerWithoutReplacement()}
+        stored = TensorDictReplayBuffer(storage=LazyTensorStorage(256), **options)
+        stored.extend(data)
+        model = make_reward_model(SHAPES, "film", seed=0, n_blocks=1, features=16)
+        return RewardLoss(model, generator=own if drawing == "loss" else None), stored
+
+    config = FitConfig(steps=12, batch_size=32, iteration=3)
+    whole, stored = parts()
+    fit(whole, stored, config, seed=0)
+    options = {"seed": 0, "checkpoint": tmp_path / "fit.pt"}
+    fit(*parts(), config, **options, until=6)
+    resumed, stored = parts()
+    fit(resumed, stored, config, **options)
+    assert all(map(torch.equal, whole.parameters(), resumed.parameters()))
 
 
 def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path):

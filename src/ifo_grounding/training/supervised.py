@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import ReplayBuffer
+from torchrl.data import RandomSampler, ReplayBuffer
 
 from ifo_grounding.errors import UserError, check_numbers
 from ifo_grounding.modules import beside, device_of
@@ -172,7 +172,9 @@ def fit(
         buffer: ``sample(batch_size)`` gives the loss its input; ``len`` of it decides how much
             ``config.prior`` counts.
         config: steps, batch size, learning rate.
-        seed: all randomness is a function of it, of ``name`` and of the iteration.
+        seed: all randomness is a function of it, of ``name`` and of the iteration, but for that of
+            generators given to the loss or the buffer, which a checkpoint keeps. A buffer that
+            prefetches draws ahead of its time: its runs do not continue to the same result.
         name: names the stream of randomness, and the progress bar.
         checkpoint: file to continue from and to save to.
         checkpoint_seconds: least time between two checkpoints.
@@ -206,8 +208,14 @@ def fit(
     if checkpoint:
         parts: dict[str, Any] = {"loss": loss, "optimizer": optimizer}
         parts |= {"held_out": held_out} if held_out else {}
+        sampler = getattr(buffer, "sampler", None)
+        if sampler is not None and not isinstance(sampler, RandomSampler):
+            parts["sampler"] = sampler  # where it is in its round
         saved = Checkpoint(checkpoint, fingerprint(config, seed, name, settings), **parts)
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
+    generators = _generators(loss, buffer)
+    for generator, drawn in zip(generators, state.get("generators", []), strict=False):
+        generator.set_state(drawn)
     history: list[Metrics] = state["history"]
     iterations = math.ceil(config.steps / config.iteration)
     last_save = time.monotonic()
@@ -234,9 +242,17 @@ def fit(
             bar.update()
             pause = time.monotonic() - last_save
             if saved and (pause > checkpoint_seconds or done == pause_at):
-                saved.save({"iteration": done, "history": history})
+                drawn = {"generators": [each.get_state() for each in generators]}
+                saved.save({"iteration": done, "history": history, **(drawn if generators else {})})
                 last_save = time.monotonic()
     return history
+
+
+def _generators(loss: nn.Module, buffer: Any) -> list[torch.Generator]:
+    """Return the generators that a loss and a buffer draw from instead of the global one."""
+    holders = [*loss.modules(), getattr(buffer, "sampler", None)]
+    held = [getattr(one, name, None) for one in holders for name in ("generator", "_rng")]
+    return list(dict.fromkeys(one for one in held if isinstance(one, torch.Generator)))
 
 
 def _iterate(
