@@ -27,6 +27,10 @@ def test_the_bot_is_recorded_without_actions():
     assert not torch.equal(other.first_frames(), demos.first_frames())
 
 
+def test_cells_may_be_of_any_size():
+    assert record_babyai("GoToObj", 1, seed=0, tile_size=10).image_shape == (3, 80, 80)
+
+
 def test_processes_record_what_one_process_records():
     alone, side_by_side = (record_babyai("GoToLocal", 4, seed=1, processes=n) for n in (1, 2))
     assert side_by_side.sentences() == alone.sentences()

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ifo_grounding.data.codec import TILE_SIZES
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.wrapping import world_seed
@@ -197,7 +198,11 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
         )
 
     demos = Demonstrations.from_episodes(
-        episodes(), vocabulary=vocabulary, length=LENGTH, tile_size=tile_size, close=False
+        episodes(),
+        vocabulary=vocabulary,
+        length=LENGTH,
+        tile_size=tile_size if tile_size in TILE_SIZES else None,
+        close=False,
     )
     return (demos, Truth(torch.tensor(actions, dtype=torch.uint8))) if keep_truth else demos
 
