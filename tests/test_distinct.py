@@ -32,6 +32,8 @@ def test_no_rows():
 
 def test_what_a_vmap_with_random_numbers_asked_first_serves_all_others():
     distinct._factors.cache_clear()
-    torch.vmap(lambda rows: rows + distinct._factors(3)[0], randomness="different")(torch.ones(2))
+    torch.vmap(lambda rows: rows + int(distinct._factors(3)[0]), randomness="different")(
+        torch.ones(2)
+    )
     rows = torch.tensor([[1, 2, 3], [1, 2, 3]])
     assert distinct_rows(rows)[0].tolist() == [[1, 2, 3]]

@@ -30,24 +30,22 @@ def attribute(source: Any, name: str) -> Any:
     Raises:
         UserError: for a stop that is no action's number, or another one in some workers.
     """
-    try:
-        value = getattr(_answering(source), name, None)
-        answers: list[Any] = list(value) if isinstance(value, (list, tuple)) else [value]
-    except Exception:  # a closed or remote env may fail in many ways; its specs then speak
-        return None
+    told = answers(source, name)
     if name == "image_shape":
-        if answers and all(isinstance(answer, (list, tuple)) for answer in answers):
-            answers = list(answers[0]) if all(each == answers[0] for each in answers) else []
-        return tuple(answers) if len(answers) == 3 else None
-    answer = answers[0] if answers else None
+        if told and all(isinstance(answer, (list, tuple)) for answer in told):
+            same = all(each == told[0] for each in told)
+            told = list(told[0]) if same else []
+        return tuple(told) if len(told) == 3 else None
+    answer = told[0] if told else None
     try:
         number = None if answer is None else operator.index(answer)
-        said = all(other == answer for other in answers)
+        said = all(other == answer for other in told)
     except TypeError:
         number, said = None, False
     if name == STOP_ACTION and not said:
+        found = told if told[1:] else answer
         raise UserError(
-            f"the environment's {STOP_ACTION} is {value!r}: it is the number of an action, the "
+            f"the environment's {STOP_ACTION} is {found!r}: it is the number of an action, the "
             "same in all worlds, or None where no action ends an episode"
         )
     return number if said else None

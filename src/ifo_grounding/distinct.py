@@ -38,12 +38,11 @@ def _hash(rows: Tensor) -> Tensor:
     """Hash rows [M, W] to 64 bits each: a sum weighed by odd numbers, modulo 2^64."""
     mixed = rows >> 29
     mixed ^= rows
-    mixed *= torch.tensor(_factors(rows.shape[1]), device=rows.device)
+    mixed *= torch.from_numpy(_factors(rows.shape[1])).to(rows.device)
     return mixed.sum(-1)
 
 
 @functools.cache
-def _factors(count: int) -> list[int]:
+def _factors(count: int) -> np.ndarray:
     """Return odd 64-bit numbers without any pattern; a tensor could belong to someone's vmap."""
-    source = np.random.default_rng(0)
-    return (source.integers(-(2**63), 2**63 - 1, count) | 1).tolist()
+    return np.random.default_rng(0).integers(-(2**63), 2**63 - 1, count) | 1

@@ -68,11 +68,11 @@ def _check_ours(folder: Path, kind: str) -> None:
         return
     try:
         found = sorted(path.name for path in folder.iterdir())
-        meta = read_json(folder / META) if META in found else None
+        meta: Any = read_json(folder / META) if META in found else None
     except FileNotFoundError:  # another writer has just put it away
         return
     ours = isinstance(meta, dict) and meta.get("format") == kind
-    arrays = meta.get("arrays") if isinstance(meta, dict) and ours else None
+    arrays = meta.get("arrays") if ours else None
     listed = {f"{name}.npy" for name in arrays} if isinstance(arrays, dict) else set()
     if others := [name for name in found if name not in listed and not (ours and name == META)]:
         raise UserError(
