@@ -259,7 +259,9 @@ def content() -> str:
         " policy then earns most that never stops"
         " ([an example](phase2.md#an-example-of-a-reward-that-is-exploited)). Preset `paper`"
         " credits each action with its own reward alone. Random instructions still teach `move`,"
-        " where every third suits by chance, and mislead `pick-out`, where hardly any does.",
+        " where every third suits by chance, and mislead `pick-out`, where hardly any does."
+        " The whole removed no false negatives on either task: where their share is not estimated,"
+        " only what passes the threshold changes.",
         ablation_content(),
     ]
     return "\n\n".join(part for part in parts if part)
@@ -274,7 +276,7 @@ VARIANTS_OF_PHASES = {
     "batch-64": "imitation in batches of 64 instead of 256",
     "batch-1024": "imitation in batches of 1,024",
     "tiles-16": "images of 96 x 96 pixels instead of 48 x 48",
-    "no-removal": "false negatives are not removed",
+    "no-removal": "the share of false negatives is not estimated: no removal, no calibration",
     "any-instruction": "random instructions instead of chosen ones",
     "action-reward": "the paper's reward of actions instead of the goal reward",
     "both-rewards": "both rewards",
