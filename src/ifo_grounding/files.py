@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -15,6 +16,8 @@ from typing import Any
 
 from ifo_grounding.errors import UserError
 
+TAKEN = (errno.ENOTEMPTY, errno.EEXIST)
+"""Another writer's folder has come in the meantime."""
 WRITERS = 20
 """How often a folder is tried to be replaced that others replace, too."""
 
@@ -56,22 +59,28 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 def _replace_folder(temporary: Path, path: Path) -> None:
     """Give a folder the name of another, which goes; of several writers the last one stays."""
-    for patience in range(WRITERS, -1, -1):
-        retired = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old")
-        try:
+    retired: list[Path] = []
+    try:
+        for patience in range(WRITERS, -1, -1):
+            retired.append(path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old"))
             with contextlib.suppress(FileNotFoundError):
-                os.replace(path, retired)
-            os.replace(temporary, path)
-            return
-        except OSError:  # another writer's folder came between the two
-            if not patience or not path.is_dir():
-                raise
-        finally:  # interrupted between the two, the old one comes back
-            if retired.exists() and not path.exists():
-                with contextlib.suppress(OSError):  # another writer's came in the meantime
-                    os.replace(retired, path)
-            if path.exists():
-                shutil.rmtree(retired, ignore_errors=True)
+                os.replace(path, retired[-1])
+            try:
+                os.replace(temporary, path)
+                return
+            except OSError as error:
+                if not patience or error.errno not in TAKEN:
+                    raise
+    finally:
+        for old in filter(Path.exists, reversed(retired)):
+            try:
+                if not path.exists():  # interrupted between the two, the old one comes back
+                    os.replace(old, path)
+                    continue
+            except OSError as error:
+                if error.errno not in TAKEN:
+                    raise
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def write_json(path: str | Path, content: Any) -> None:
