@@ -94,17 +94,11 @@ class NetworkConfig:
         if by_word and self.preset == "paper":
             raise UserError("matching='words' reads patches: it needs preset 'strong' or 'film'")
         least = {
-            "features": 1,
-            "conv_layers": 1 if self.preset == "paper" else 0,
-            "n_blocks": 0,
-            "kernel": 1,
-            "context": 0,
-            "heads": 0,
-            "values": 0,
-            "detectors": 0,
-            "maps": 1 if by_word else 0,
-            "embedding": 1,
-            "hidden": 2 if by_word else 1,
+            **dict.fromkeys(("n_blocks", "context", "heads", "values", "detectors"), 0),
+            **dict.fromkeys(("features", "kernel", "embedding"), 1),
+            "conv_layers": int(self.preset == "paper"),
+            "maps": int(by_word),
+            "hidden": 1 + by_word,
         }
         if self.patch_size is not None:
             least["patch_size"] = 1
