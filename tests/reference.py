@@ -85,7 +85,8 @@ def resolve(world: Plain, wish: Wish) -> tuple[Cell, Cell]:
     mentioned.append(places)
     anchors = places
     if wish.task == "pick-udlr":
-        anchors = [cell for cell, kind in objects.items() if kind == wish.reference]
+        others = [(cell, kind) for cell, kind in objects.items() if cell not in places]
+        anchors = [cell for cell, kind in others if kind == wish.reference]
         mentioned.append(anchors)
     if wish.task in ("pick", "pick-out"):
         anchors = [cell for cell, colour in boxes.items() if colour == wish.target]

@@ -24,7 +24,15 @@ PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
             "strong",
             ["world.split=train", "evaluate.split=zero-shot", "self_examine.recombine=true"],
         ),
-        ("pick-out", "film", ["self_examine.kind=both", "self_examine.reward_steps=1"]),
+        (
+            "pick-out",
+            "film",
+            [
+                "self_examine.kind=both",
+                "self_examine.reward_steps=1",
+                "self_examine.recombine=true",  # which also says what makes no sense
+            ],
+        ),
     ],
 )
 def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, preset, extra):

@@ -162,6 +162,18 @@ OUT = {"object": RED, "source": "pink", "target": "green"}
             {"objects": {(2, 2): RED, (3, 4): BLUE, (1, 1): BLUE}},
             "ambiguous",
         ),
+        (  # nothing is beside itself
+            "pick-udlr",
+            {"object": RED, "reference": RED, "side": "below"},
+            {"objects": {(2, 2): RED, (3, 4): BLUE}},
+            "missing",
+        ),
+        (
+            "pick-out",
+            {"object": RED, "source": "green", "target": "green"},
+            {"objects": {(4, 4): RED}, "boxes": {(4, 4): "green"}},
+            "already true",
+        ),
     ],
 )
 def test_verdicts_by_hand(task, wish, things, expected):

@@ -91,7 +91,7 @@ def plan(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Plan:
     anchor = places
     to_box = (goal.task == PICK) | (goal.task == PICK_OUT)
     if (beside_object := goal.task == PICK_UDLR).any():
-        is_reference = _shows(state.objects, goal.reference)
+        is_reference = _shows(state.objects, goal.reference) & ~is_object  # nothing beside itself
         anchor = torch.where(beside_object, _first(is_reference), places)
         counts.append(torch.where(beside_object, is_reference.sum(-1), 1))
     beside, inside = neighbour(anchor, goal.side, state.size)

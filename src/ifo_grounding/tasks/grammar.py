@@ -53,16 +53,25 @@ def _phrasings(task: str) -> tuple[str, ...]:
             f"{verb} the {{object}} from the {{source}} box {into} the {{target}} box"
             for verb, into in itertools.product(verbs, ("to", "into", "inside"))
         ]
-        takes = ("take", "get", "pick", "lift", "pull", "remove")
-        staged = [
-            f"{take} the {{object}} {'from' if take == 'remove' else 'out of'} the {{source}} box "
-            f"and {put} the {{target}} box"
-            for take, put in itertools.product(takes, ("put it into", "place it in", "drop it in"))
-        ]
-        return (*direct, *staged)
+        return (*direct, *_staged(("put it into", "place it in", "drop it in")))
     direct = [f"{verb} the {{object}} {{side}} the {{reference}}" for verb in _PUTS]
     staged = [f"pick up the {{object}} and {verb} it {{side}} the {{reference}}" for verb in _PUTS]
     return (*direct, *staged)
+
+
+def _staged(puts: tuple[str, ...]) -> list[str]:
+    """Return the wordings of pick-out that say both steps."""
+    takes = ("take", "get", "pick", "lift", "pull", "remove")
+    return [
+        f"{take} the {{object}} {'from' if take == 'remove' else 'out of'} the {{source}} box "
+        f"and {put} the {{target}} box"
+        for take, put in itertools.product(takes, puts)
+    ]
+
+
+def _unsaid_phrasings(task: int) -> list[str]:
+    """Return the wordings that nobody says, made of the words of those that are said."""
+    return _staged(("put it in", "place it into", "drop it into")) if task == PICK_OUT else []
 
 
 _PUTS = ("put", "place", "drop")
@@ -149,26 +158,40 @@ class Grammar:
     def parse(self, sentences: str | list[str]) -> Goal:
         """Return the goal of each sentence, [N].
 
+        Sentences that exchange words of this task's (:func:`~ifo_grounding.data.recombined`) are
+        read, too: other wordings, and what makes no sense, such as from a box into the same box,
+        whose goal suits no state.
+
         Raises:
             UserError: where a sentence is none of this task's.
         """
         if isinstance(sentences, str):
             sentences = [sentences]
-        return self.goals[torch.tensor([self._row(sentence) for sentence in sentences])]
+        wanted = [" ".join(sentence.lower().split()) for sentence in sentences]
+        rows, goals = self._by_sentence, self.goals
+        if not rows.keys() >= set(wanted):
+            rows, goals = self._unsaid
+        for given, sentence in zip(sentences, wanted, strict=True):
+            if sentence not in rows:
+                raise UserError(
+                    f"{given!r} is no sentence of {TASKS[self.task]}; "
+                    f"it says such as {self.sentences[0]!r}"
+                )
+        return goals[torch.tensor([rows[sentence] for sentence in wanted], dtype=torch.int64)]
 
     def parse_tokens(self, tokens: Tensor) -> Goal:
         """Return the goal of each row of token ids [N, 16], [N] on the tokens' device."""
         distinct, inverse = tokens.cpu().unique(dim=0, return_inverse=True)
         return self.parse(VOCABULARY.decode(distinct))[inverse].to(tokens.device)
 
-    def _row(self, sentence: str) -> int:
-        row = self._by_sentence.get(" ".join(sentence.lower().split()))
-        if row is None:
-            raise UserError(
-                f"{sentence!r} is no sentence of {TASKS[self.task]}; "
-                f"it says such as {self.sentences[0]!r}"
-            )
-        return row
+    @functools.cached_property
+    def _unsaid(self) -> tuple[dict[str, int], Goal]:
+        """What is read, be it said or not, and the goal of each, [R]."""
+        phrasings = (*self.phrasings, *_unsaid_phrasings(self.task))
+        fields = [*_fillers(self.task), *_senseless_fillers(self.task)]
+        sentences = [_fill(phrasing, row) for row in fields for phrasing in phrasings]
+        goals = self._goal(torch.tensor(fields).repeat_interleave(len(phrasings), 0))
+        return {sentence: row for row, sentence in enumerate(sentences)}, goals
 
 
 @functools.cache
@@ -193,6 +216,15 @@ def _fillers(task: int) -> Iterator[tuple[int, ...]]:
             yield from ((item, other, 0, 0, side) for other in others for side in sides)
         else:
             yield (item, 0, 0, 0, 0)
+
+
+def _senseless_fillers(task: int) -> Iterator[tuple[int, ...]]:
+    """Yield the fields of what names one thing in two roles: no goal, yet words in their places."""
+    for item in range(1, N_KINDS + 1):
+        if task == PICK_OUT:
+            yield from ((item, 0, box, box, 0) for box in range(1, N_BOXES + 1))
+        elif task == PICK_UDLR:
+            yield from ((item, item, 0, 0, side) for side in range(len(SIDES)))
 
 
 def _fill(phrasing: str, fields: tuple[int, ...]) -> str:
