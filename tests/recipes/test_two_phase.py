@@ -10,6 +10,7 @@ from ifo_grounding import networks
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.report import results_table
+from pretended_gpu import pretended_gpu
 
 PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
 
@@ -80,6 +81,37 @@ def test_both_phases_run_through_and_write_a_report(compose, tmp_path, task, pre
     stamps = {path: path.stat().st_mtime_ns for path in run.rglob("*.safetensors")}
     assert two_phase(options) == results
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "extra"),
+    [
+        ("move", "strong", []),
+        pytest.param("pick", "paper", ["self_examine.kind=both"], marks=pytest.mark.slow),
+    ],
+)
+def test_both_phases_run_on_a_gpu(compose, task, preset, extra):
+    from two_phase import two_phase
+
+    few = [
+        f"{net}.batch_size=16" for net in ("inverse", "imitate", "instruction", "reward", "goal")
+    ]
+    few += [
+        "demonstrations.n=60",
+        "transitions.n=1000",
+        "instruction.steps=5",
+        "goal.steps=5",
+        "self_examine.num_envs=8",
+        "self_examine.select_episodes=8",
+        "evaluate.episodes=10",
+        "evaluate.states=20",
+        "evaluate.audit_episodes=10",
+    ]
+    options = compose("two_phase", f"task={task}", f"preset={preset}", "device=cuda", *few, *extra)
+    with pretended_gpu():
+        results = two_phase(options)
+    assert results["phase2"]["rate"]["count"] == 10
+    assert results["phase1"]["scenes"] == results["phase2"]["scenes"]
 
 
 def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):

@@ -1,0 +1,57 @@
+"""Everything takes a device: where there is no GPU, one is pretended."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, TransformedEnv
+
+from ifo_grounding.data import collect_transitions, record_demonstrations
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.networks import make_instruction_classifier, make_policy, make_reward_model
+from ifo_grounding.transforms import InstructionSampler, LearnedReward
+from pretended_gpu import pretended_gpu
+
+
+def test_what_is_pretended_refuses_what_a_gpu_refuses(tmp_path):
+    with pretended_gpu():
+        there = torch.ones(3, device="cuda")
+        layer = nn.Linear(3, 2).to("cuda")
+        assert layer(there).device == layer.weight.device == there.device
+        layer(there).sum().backward()
+        assert layer.weight.grad.is_cuda
+        torch.optim.Adam(layer.parameters(), fused=True).step()
+        assert (there[torch.tensor([0, 2])] * torch.tensor(2)).is_cuda
+        torch.save({"a": there, "b": there.cpu()}, tmp_path / "both.pt")
+        both = torch.load(tmp_path / "both.pt")
+        assert both["a"].is_cuda
+        assert not both["b"].is_cuda
+        for wrong in (
+            lambda: layer(torch.ones(3)),
+            lambda: there + torch.ones(3),
+            lambda: torch.ones(3)[torch.zeros(1, dtype=torch.int64, device="cuda")],
+            lambda: torch.rand(3, device="cuda", generator=torch.Generator()),
+            there.numpy,
+        ):
+            with pytest.raises((RuntimeError, TypeError), match=r"device|GPU"):
+                wrong()
+    assert torch.ones(3).device.type == "cpu"
+
+
+def test_transforms_collect_on_a_gpu():
+    demos = record_demonstrations("pick", 20, seed=0)
+    with pretended_gpu():
+        env = PickAndPlaceEnv("pick", num_envs=8, seed=0, device="cuda", instructed=False)
+        classifier = make_instruction_classifier(demos, device="cuda", seed=0)
+        judge = make_reward_model(demos, device="cuda", seed=0)
+        chooser = InstructionSampler(classifier, demos.pool(), threshold=0.0)
+        env = TransformedEnv(env, Compose(chooser, LearnedReward(judge)))
+        policy = make_policy(demos, device="cuda", seed=0)
+        for batch in Collector(env, policy, frames_per_batch=64, total_frames=64, device="cuda"):
+            assert batch["next", "learned_reward"].is_cuda
+            assert batch["pixels"].is_cuda
+        plain = PickAndPlaceEnv("pick", num_envs=8, seed=0, device="cuda", instructed=False)
+        buffer, _ = collect_transitions(plain, 50, seed=0)
+        assert len(buffer) > 0
