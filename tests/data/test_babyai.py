@@ -39,6 +39,12 @@ def test_processes_record_what_one_process_records():
     assert torch.equal(side_by_side.frames(numbers), alone.frames(numbers))
 
 
+def test_a_level_s_full_name_draws_the_same_rooms():
+    short, full = (record_babyai(level, 3, seed=0) for level in ("GoToObj", "BabyAI-GoToObj-v0"))
+    assert torch.equal(short.instructions, full.instructions)
+    assert torch.equal(short.frames(torch.arange(3)), full.frames(torch.arange(3)))
+
+
 def test_a_bot_s_steps_are_steps_of_the_environment():
     demos = record_babyai("GoToObj", 3, seed=0)
     env = from_gymnasium(

@@ -177,7 +177,7 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
     if whole("n", n) < 1 or whole("processes", processes) < 1:
         raise UserError(f"n and processes must be at least 1, got {n} and {processes}")
     play = functools.partial(_play, babyai(level, tile_size))
-    name = f"{level} {stream}"
+    name = f"{level.removeprefix('BabyAI-').removesuffix('-v0')} {stream}"
     seeds = (derive(seed, "babyai", name, number) % 2**31 for number in range(PATIENCE * n))
     actions: list[int] = []
 
