@@ -135,10 +135,9 @@ class _Mode(TorchFunctionMode):
             return function(*args, **kwargs)
         if id(value) not in memo:
             copied = _put(_taken(value).detach().clone()).requires_grad_(value.requires_grad)
-            parameter = isinstance(value, torch.nn.Parameter)
-            memo[id(value)] = (
-                torch.nn.Parameter(copied, value.requires_grad) if parameter else copied
-            )
+            if isinstance(value, torch.nn.Parameter):
+                copied = torch.nn.Parameter(copied, value.requires_grad)
+            memo[id(value)] = copied
         return memo[id(value)]
 
 
@@ -212,10 +211,10 @@ def _loading(load: Callable) -> Callable:
         placed = iter(content[PLACED])
 
         def restored(tensor: torch.Tensor) -> torch.Tensor:
-            was = next(placed)
-            return (
-                _put(tensor) if (was if map_location is None else _is_gpu(map_location)) else tensor
-            )
+            there = next(placed)
+            if map_location is not None:
+                there = _is_gpu(map_location)
+            return _put(tensor) if there else tensor
 
         return tree_map_only(torch.Tensor, restored, content["content"])
 

@@ -170,7 +170,7 @@ class Grammar:
         wanted = [" ".join(sentence.lower().split()) for sentence in sentences]
         rows, goals = self._by_sentence, self.goals
         if not rows.keys() >= set(wanted):
-            rows, goals = self._unsaid
+            rows, goals = self._readable
         for given, sentence in zip(sentences, wanted, strict=True):
             if sentence not in rows:
                 raise UserError(
@@ -185,8 +185,8 @@ class Grammar:
         return self.parse(VOCABULARY.decode(distinct))[inverse].to(tokens.device)
 
     @functools.cached_property
-    def _unsaid(self) -> tuple[dict[str, int], Goal]:
-        """What is read, be it said or not, and the goal of each, [R]."""
+    def _readable(self) -> tuple[dict[str, int], Goal]:
+        """Rows of all sentences that are read, be they said or not, and the goal of each, [R]."""
         phrasings = (*self.phrasings, *_unsaid_phrasings(self.task))
         fields = [*_fillers(self.task), *_senseless_fillers(self.task)]
         sentences = [_fill(phrasing, row) for row in fields for phrasing in phrasings]
