@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
 from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_leaves, tree_map_only
+from torch.utils._pytree import tree_map_only
 
 GPU = torch.device("cuda", 0)
 PLACED = "pretended"
@@ -73,11 +73,12 @@ class _Mode(TorchFunctionMode):
             with self:  # such as a tensor class, which calls what it is made of
                 return foreign[0].__torch_function__(function, types, args, kwargs)
         name = getattr(function, "__name__", "")
-        if special := getattr(self, name.strip("_") + "_", None):
-            return special(function, args, kwargs)
+        if special := self.special.get(name):
+            return special(self, function, args, kwargs)
         inputs = list(_tensors((*args, *kwargs.values())))
         here = any(map(_on_gpu, inputs))
-        _check_inputs(name, inputs)
+        if here:
+            _check_inputs(name, inputs)
         if "device" in kwargs:
             here = _is_gpu(kwargs["device"]) if kwargs["device"] is not None else here
             kwargs["device"] = "cpu" if here else kwargs["device"]
@@ -90,12 +91,12 @@ class _Mode(TorchFunctionMode):
             return _put(result) if here and name != "copy_" else result
         return tree_map_only(torch.Tensor, _put, result) if here else result
 
-    def get_(self, function: Any, args: Any, kwargs: Any) -> Any:
+    def get(self, function: Any, args: Any, kwargs: Any) -> Any:
         with torch._C.DisableTorchFunctionSubclass():
             result = function(*args, **kwargs)
         return _put(result) if isinstance(result, torch.Tensor) and _on_gpu(args[0]) else result
 
-    def to_(self, function: Any, args: Any, kwargs: Any) -> Any:
+    def to(self, function: Any, args: Any, kwargs: Any) -> Any:
         before, *others = args
         there = _on_gpu(before)
         for place, value in [*enumerate(others), *kwargs.items()]:
@@ -110,26 +111,24 @@ class _Mode(TorchFunctionMode):
                 after = after.clone()
         return _put(after) if there else _taken(after)
 
-    def cpu_(self, function: Any, args: Any, kwargs: Any) -> Any:
-        return self.to_(torch.Tensor.to, (args[0], "cpu"), kwargs)
+    def cpu(self, function: Any, args: Any, kwargs: Any) -> Any:
+        return self.to(torch.Tensor.to, (args[0], "cpu"), kwargs)
 
-    def cuda_(self, function: Any, args: Any, kwargs: Any) -> Any:
-        return self.to_(torch.Tensor.to, (args[0], GPU), kwargs)
+    def cuda(self, function: Any, args: Any, kwargs: Any) -> Any:
+        return self.to(torch.Tensor.to, (args[0], GPU), kwargs)
 
-    def parse_to_(self, function: Any, args: Any, kwargs: Any) -> Any:
+    def parse_to(self, function: Any, args: Any, kwargs: Any) -> Any:
         return function(*args, **kwargs)
 
-    def has_compatible_shallow_copy_type_(self, function: Any, args: Any, kwargs: Any) -> bool:
+    def has_compatible_shallow_copy_type(self, function: Any, args: Any, kwargs: Any) -> bool:
         return _on_gpu(args[0]) == _on_gpu(args[1])
 
-    def numpy_(self, function: Any, args: Any, kwargs: Any) -> Any:
+    def numpy(self, function: Any, args: Any, kwargs: Any) -> Any:
         if _on_gpu(args[0]):
             raise TypeError("a tensor on a GPU cannot be read by NumPy: copy it with cpu() first")
         return function(*args, **kwargs)
 
-    array_ = numpy_
-
-    def deepcopy_(self, function: Any, args: Any, kwargs: Any) -> Any:
+    def deepcopy(self, function: Any, args: Any, kwargs: Any) -> Any:
         value, memo = args
         if not _on_gpu(value):
             return function(*args, **kwargs)
@@ -139,6 +138,19 @@ class _Mode(TorchFunctionMode):
                 copied = torch.nn.Parameter(copied, value.requires_grad)
             memo[id(value)] = copied
         return memo[id(value)]
+
+    special: ClassVar = {
+        "__get__": get,
+        "to": to,
+        "cpu": cpu,
+        "cuda": cuda,
+        "_parse_to": parse_to,
+        "_has_compatible_shallow_copy_type": has_compatible_shallow_copy_type,
+        "numpy": numpy,
+        "__array__": numpy,
+        "__deepcopy__": deepcopy,
+    }
+    """Functions, by name, of which more is to be said than where their result lies."""
 
 
 def _tensors(values: Iterable[Any]) -> Iterator[torch.Tensor]:
@@ -151,7 +163,7 @@ def _tensors(values: Iterable[Any]) -> Iterator[torch.Tensor]:
 
 def _check_inputs(name: str, inputs: list[torch.Tensor]) -> None:
     """Refuse what CUDA refuses: tensors on two devices, unless one of them is a mere number."""
-    if not any(map(_on_gpu, inputs)) or name in ACROSS:
+    if name in ACROSS:
         return
     if name in INDEXING and _on_gpu(inputs[0]):  # by indices that may lie anywhere
         return
@@ -196,9 +208,14 @@ def _saving(save: Callable) -> Callable:
     """Write plain tensors, and which of them lay on the GPU."""
 
     def saved(content: Any, *args: Any, **kwargs: Any) -> None:
-        placed = [_on_gpu(each) for each in tree_leaves(content) if isinstance(each, torch.Tensor)]
-        plain = tree_map_only(torch.Tensor, lambda each: _taken(each.detach()), content)
-        save({PLACED: placed, "content": plain}, *args, **kwargs)
+        placed = []
+
+        def plain(tensor: torch.Tensor) -> torch.Tensor:
+            placed.append(_on_gpu(tensor))
+            return _taken(tensor.detach())
+
+        content = tree_map_only(torch.Tensor, plain, content)
+        save({PLACED: placed, "content": content}, *args, **kwargs)
 
     return saved
 

@@ -130,21 +130,23 @@ class Grammar:
         self.phrasings = PHRASINGS[task]
         fields = list(_fillers(self.task))
         table = torch.tensor(fields)
-        self.sentences = tuple(
-            _fill(phrasing, row) for row in fields for phrasing in self.phrasings
-        )
+        self.sentences, self.goals = self._spelled_out(fields, self.phrasings)
+        """Every sentence, and the goal of each, [S]."""
         self.tokens = VOCABULARY.encode(self.sentences)
         """Token ids of every sentence, int64 [S, 16]."""
-        self.goals = self._goal(table.repeat_interleave(len(self.phrasings), 0))
-        """Goal of every sentence, [S]."""
         self._by_sentence = {sentence: row for row, sentence in enumerate(self.sentences)}
         self._goal_rows = torch.full((N_KINDS + 1, N_KINDS + 1, N_BOXES + 1, N_BOXES + 1, 4), -1)
         self._goal_rows[tuple(table.unbind(-1))] = torch.arange(len(fields))
 
-    def _goal(self, fields: Tensor) -> Goal:
-        columns = dict(zip(FIELDS, fields.unbind(-1), strict=True))
+    def _spelled_out(
+        self, fields: list[tuple[int, ...]], phrasings: tuple[str, ...]
+    ) -> tuple[tuple[str, ...], Goal]:
+        """Return the sentences of goals in all wordings, goal by goal, and the goal of each."""
+        sentences = tuple(_fill(phrasing, row) for row in fields for phrasing in phrasings)
+        table = torch.tensor(fields).repeat_interleave(len(phrasings), 0)
+        columns = dict(zip(FIELDS, table.unbind(-1), strict=True))
         task = torch.full_like(columns["object"], self.task)
-        return Goal(task=task, **columns, batch_size=task.shape)
+        return sentences, Goal(task=task, **columns, batch_size=task.shape)
 
     def encode(self, goal: Goal, phrasing: Tensor) -> Tensor:
         """Return the tokens of goals [*B] in the given wordings [*B], int64 [*B, 16]."""
@@ -189,8 +191,7 @@ class Grammar:
         """Rows of all sentences that are read, be they said or not, and the goal of each, [R]."""
         phrasings = (*self.phrasings, *_unsaid_phrasings(self.task))
         fields = [*_fillers(self.task), *_senseless_fillers(self.task)]
-        sentences = [_fill(phrasing, row) for row in fields for phrasing in phrasings]
-        goals = self._goal(torch.tensor(fields).repeat_interleave(len(phrasings), 0))
+        sentences, goals = self._spelled_out(fields, phrasings)
         return {sentence: row for row, sentence in enumerate(sentences)}, goals
 
 
