@@ -16,7 +16,7 @@ from torchrl import torchrl_logger
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.data import Demonstrations, LabelReport, recombined
-from ifo_grounding.data.pictures import LIST, read_list
+from ifo_grounding.data.listing import LIST, read_list
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.report import format_cell, text_table

@@ -23,7 +23,7 @@ from ifo_grounding.data import (
     record_demonstrations,
 )
 from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
-from ifo_grounding.data.pictures import LIST
+from ifo_grounding.data.listing import LIST
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv, from_gymnasium
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.tasks import VOCABULARY, Vocabulary, grammar

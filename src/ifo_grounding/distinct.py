@@ -28,8 +28,8 @@ def distinct_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
     values, index = torch.unique(_hash(rows), return_inverse=True)
     numbers = torch.arange(len(rows), device=rows.device)
     first = numbers.new_zeros(len(values)).scatter_(0, index, numbers)
-    found = rows[first]
-    if torch.equal(found[index], rows):
+    found = rows.index_select(0, first)  # many times as fast as rows[first]
+    if torch.equal(found.index_select(0, index), rows):
         return found, index
     return torch.unique(rows, dim=0, return_inverse=True)
 

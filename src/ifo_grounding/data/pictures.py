@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import re
-from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageSequence
+from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
 from ifo_grounding.data._episodes import refuse_empty
+from ifo_grounding.data._gif import animation_frames, save_gif
 from ifo_grounding.data._reading import BROKEN, COLOURS, LAST, MODES, naming, stack_pictures
 from ifo_grounding.data._video import read_video, write_video
 from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.listing import LIST, VIDEOS, Listed, read_list
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import atomic_write
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
-LIST = "episodes.jsonl"
 FORMATS = ("png", "gif", "mp4")
-VIDEOS = {".mp4", ".mov", ".mkv", ".avi", ".webm"}
-ANIMATED = (".gif", *sorted(VIDEOS))
 FILES = {
     ".png",
     ".jpg",
@@ -43,20 +39,6 @@ FILES = {
     ".tga",
 }
 MILLISECONDS = 250
-COMMENT = b"ifo-grounding: a frame lasts %d ms"
-"""Kept in a GIF, where Pillow writes equal frames in a row as one that lasts longer."""
-EXTENSION, PICTURE, TRAILER = 0x21, 0x2C, 0x3B
-"""First bytes of the blocks of a GIF."""
-
-
-@dataclass(frozen=True)
-class Listed:
-    """A line of the list."""
-
-    name: str
-    instruction: str
-    path: Path
-    """Folder of pictures, one animated picture, or a video."""
 
 
 def load_pictures(
@@ -106,69 +88,6 @@ def load_pictures(
     )
 
 
-def read_list(folder: Path) -> list[Listed]:
-    """Read the list of a folder's episodes.
-
-    Raises:
-        UserError: where it is missing or empty, or a line of it is not as it has to be.
-    """
-    path = folder / LIST
-    if not path.exists():
-        raise UserError(
-            f"{path} does not exist: write one line per episode, such as "
-            '{"episode": "0001", "instruction": "go to the red ball"}'
-        )
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path} cannot be read ({error}): save it as UTF-8") from None
-    animations = functools.cache(_animations)
-    episodes: list[Listed] = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            entry = json.loads(line)
-            name, instruction = str(entry["episode"]), entry["instruction"]
-        except (json.JSONDecodeError, KeyError, TypeError):
-            raise UserError(
-                f"{path}, line {number}: a line is a JSON object with 'episode' and 'instruction'"
-            ) from None
-        if not isinstance(instruction, str) or not instruction.strip():
-            raise UserError(
-                f"episode {name!r} has no instruction ({path}, line {number}): give a sentence, "
-                f"not {json.dumps(instruction)}"
-            )
-        where = _where(folder, name, entry.get("frames"), animations)
-        episodes.append(Listed(name, instruction.strip(), where))
-    if not episodes:
-        raise UserError(f"{path} lists no episode")
-    name, times = Counter(episode.name for episode in episodes).most_common(1)[0]
-    if times > 1:
-        raise UserError(f"{path} lists episode {name!r} {times} times")
-    return episodes
-
-
-def _where(
-    folder: Path, name: str, given: object, animations: Callable[[Path], dict[str, Path]]
-) -> Path:
-    path = folder / (name if given is None else str(given))
-    if given is None and not path.exists():
-        beside = animations(path.parent)
-        names = (f"{path.name}{suffix}" for suffix in ANIMATED)
-        path = next((beside[name] for name in names if name in beside), path)
-    if not path.exists():
-        raise UserError(f"episode {name!r} has no frames: {path} does not exist")
-    return path
-
-
-def _animations(folder: Path) -> dict[str, Path]:
-    """Return the animated pictures and videos of a folder by name, with suffixes in lower case."""
-    paths = sorted(folder.iterdir()) if folder.is_dir() else ()
-    named = {f"{path.stem}{path.suffix.lower()}": path for path in paths}
-    return {name: path for name, path in named.items() if name.endswith(ANIMATED)}
-
-
 def _pictures(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
     """Yield name and picture of each frame."""
     if episode.path.is_dir():
@@ -194,15 +113,8 @@ def _pictures(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
                     _check_single(episode.name, path, opened)
                     yield path.name, opened
                     continue
-                lasts = None
-                if opened.format == "GIF":
-                    _check_gif(path.read_bytes())
-                    lasts = _lasts(opened)
-                for number, frame in enumerate(ImageSequence.Iterator(opened)):
-                    name = f"{path.name}, frame {number}"
-                    times = round(frame.info.get("duration", 0) / lasts) if lasts else 1
-                    for _ in range(max(1, times)):
-                        yield name, frame
+                for number, frame in animation_frames(path, opened):
+                    yield f"{path.name}, frame {number}", frame
         except BROKEN as error:
             raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
 
@@ -248,39 +160,6 @@ def _check_numbers(name: str, paths: list[Path]) -> None:
             )
 
 
-def _check_gif(content: bytes) -> None:
-    """Refuse a GIF that is cut short: Pillow takes what there is where a block has ended.
-
-    Raises:
-        OSError: where its blocks do not lead to its trailer.
-    """
-    try:
-        at = 13 + _palette_bytes(content[10])
-        while content[at] != TRAILER:
-            if content[at] == PICTURE:
-                at += 11 + _palette_bytes(content[at + 9])
-            elif content[at] == EXTENSION:
-                at += 2
-            else:  # bytes between blocks mean nothing
-                at += 1
-                continue
-            while content[at]:
-                at += 1 + content[at]
-            at += 1
-    except IndexError:
-        raise OSError("it is cut short") from None
-
-
-def _palette_bytes(flags: int) -> int:
-    return 3 << (flags & 7) + 1 if flags & 0x80 else 0
-
-
-def _lasts(gif: Image.Image) -> int | None:
-    """Return the milliseconds that a frame of a GIF lasts, where it says so."""
-    said = re.fullmatch(COMMENT.replace(b"%d", b"([1-9][0-9]*)"), gif.info.get("comment", b""))
-    return int(said[1]) if said else None
-
-
 def save_pictures(
     demos: Demonstrations, folder: str | Path, *, kind: str = "png", scale: int = 1
 ) -> None:
@@ -323,29 +202,12 @@ def save_pictures(
                 continue
             pictures = [Image.fromarray(frame) for frame in frames]
             if kind == "gif":
-                _save_gif(temporary / f"{name}.gif", pictures)
+                save_gif(temporary / f"{name}.gif", pictures, MILLISECONDS)
                 continue
             (temporary / name).mkdir()
             for step, picture in enumerate(pictures):
                 picture.save(temporary / name / f"{step:04d}.png")
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _save_gif(path: Path, pictures: list[Image.Image]) -> None:
-    try:
-        pictures[0].save(
-            path,
-            save_all=True,
-            append_images=pictures[1:],
-            duration=MILLISECONDS,
-            comment=COMMENT % MILLISECONDS,
-            loop=0,
-        )
-    except OverflowError:
-        raise UserError(
-            f"episode {path.stem!r} stays the same for longer than a GIF can say: save it with "
-            "kind='png'"
-        ) from None
 
 
 def check_colours(demos: Demonstrations, allowed: tuple[int, ...] = COLOURS) -> None:
