@@ -122,6 +122,9 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
         (["task=fly"], "unknown task 'fly': choose move or pick"),
         (["task=missing"], "option 'folder' is required: give it a value"),
         (["-m", "preset=paper,huge"], "unknown preset 'huge': choose one of paper, strong"),
+        (["-m", "steps=1,many"], "option 'steps' takes a whole number, not 'many'"),
+        (["-m", "steps=range(0, 1, 0.5)"], "option 'steps' takes a whole number, not 0.0"),
+        (["-m", "sizes=[3],4"], "option 'sizes' takes a list, not 4"),
     ],
 )
 def test_a_mistake_gets_one_line_and_code_2(recipes, capsys, arguments, said):
@@ -143,8 +146,10 @@ def test_what_options_offer_is_accepted(recipes, capsys, argument):
 
 
 def test_several_values_run_one_after_the_other(recipes, capsys):
-    assert run("run", "greet", "--multirun", "task=move,pick") == 0
+    assert run("run", "greet", "--multirun", "task=move,pick", "nested.rate=0.5") == 0
     assert capsys.readouterr().out == "hello move 0.5 64\nhello pick 0.5 64\n"
+    assert run("run", "greet", "--multirun", "preset=glob(*)", "limit=range(2)") == 0
+    assert capsys.readouterr().out.count("hello") == 4
     assert list(Path.cwd().iterdir()) == []
 
 

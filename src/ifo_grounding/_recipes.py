@@ -126,8 +126,6 @@ def check_options(conf: Path, name: str, arguments: Sequence[str]) -> Namespace:
         UserError: for the first that the options do not offer.
     """
     from hydra import initialize_config_dir
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
 
     flags = _parse_flags(arguments)
     name = flags.config_name or name
@@ -137,14 +135,8 @@ def check_options(conf: Path, name: str, arguments: Sequence[str]) -> Namespace:
         raise UserError(f"there are no options named {name!r} in {conf}: choose one of {listed}")
     if flags.config_dir is not None or flags.hydra_help:
         return flags
-    overrides = []
-    for text in flags.overrides:
-        try:
-            overrides.append(OverridesParser.create().parse_override(text))
-        except HydraException:
-            raise UserError(f"cannot read {text!r}: options are written name=value") from None
     with initialize_config_dir(version_base=None, config_dir=str(conf), job_name=name):
-        _check_overrides(name, overrides, several=flags.multirun)
+        _check_overrides(name, flags.overrides, several=flags.multirun)
     return flags
 
 
@@ -166,15 +158,21 @@ def _parse_flags(arguments: Sequence[str]) -> Namespace:
     return flags
 
 
-def _check_overrides(name: str, overrides: Sequence[Override], several: bool) -> None:
+def _check_overrides(name: str, texts: Sequence[str], several: bool) -> None:
     from hydra import compose
     from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
     loader = GlobalHydra.instance().config_loader()
+    parser = OverridesParser.create(config_loader=loader)
     groups, values = [], []
-    for override in overrides:
+    for text in texts:
+        try:
+            (override,) = parser.parse_overrides([text])
+        except HydraException:
+            raise UserError(f"cannot read {text!r}: options are written name=value") from None
         key = override.key_or_group
         if override.is_sweep_override() and not several:
             raise UserError(f"option {key!r} got several values: add --multirun to run each")
@@ -213,9 +211,7 @@ def _check_group(name: str, override: Override) -> None:
 
 
 def _check_choices(override: Override, allowed: list[str]) -> None:
-    several = override.is_sweep_override()
-    wanted = list(override.sweep_string_iterator()) if several else [override.value()]
-    for choice in wanted:
+    for choice in _values(override):
         if isinstance(choice, str) and choice not in allowed:
             listed = ", ".join(allowed)
             raise UserError(f"unknown {override.key_or_group} {choice!r}: choose one of {listed}")
@@ -230,14 +226,28 @@ def _check_value(defaults: DictConfig, override: Override, choices: list[str]) -
         _check_added(key)
         return
     section, name = _locate(defaults, key, choices)
-    if override.is_delete() or override.is_sweep_override():
+    if override.is_delete():
         return
     if OmegaConf.is_missing(section, name):
         return  # what is required has no kind of its own
     try:
-        default, given = section[name], override.value()
+        default = section[name]
     except OmegaConfBaseException:
         return  # nor has what is composed of others that only a run knows
+    for given in _values(override):
+        _check_kind(key, name, default, given)
+
+
+def _values(override: Override) -> list[Any]:
+    """Return the value of an option, or each of a sweep that lists them."""
+    if not override.is_sweep_override():
+        return [override.value()]
+    return list(override.sweep_iterator()) if override.is_discrete_sweep() else []
+
+
+def _check_kind(key: str, name: str, default: Any, given: Any) -> None:
+    from omegaconf import OmegaConf
+
     kind = list if OmegaConf.is_list(default) else float if name in _NUMBERS else type(default)
     if OmegaConf.is_dict(default) and not isinstance(given, dict):
         listed = ", ".join(map(str, default))
