@@ -8,7 +8,7 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
 
-from ifo_grounding.data import collect_transitions, record_demonstrations
+from ifo_grounding.data import Demonstrations, collect_transitions, record_demonstrations
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.networks import make_instruction_classifier, make_policy, make_reward_model
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
@@ -55,3 +55,14 @@ def test_transforms_collect_on_a_gpu():
         plain = PickAndPlaceEnv("pick", num_envs=8, seed=0, device="cuda", instructed=False)
         buffer, _ = collect_transitions(plain, 50, seed=0)
         assert len(buffer) > 0
+
+
+def test_frames_of_a_gpu_become_demonstrations():
+    demos = record_demonstrations("move", 3, seed=0)
+    with pretended_gpu():
+        frames = [demos[number]["pixels"].to("cuda") for number in range(3)]
+        made = Demonstrations.from_arrays(frames, demos.sentences())
+        assert torch.equal(made.frames(torch.arange(2)), frames[0][:2].cpu())
+        which = torch.tensor([2, 0], device="cuda")
+        assert torch.equal(made.first_frames(which)[0], frames[2][0].cpu())
+        assert torch.equal(made[which].lengths, made.lengths[[2, 0]])

@@ -359,3 +359,31 @@ def test_the_luck_of_shared_scenes_passes_for_a_gain_no_more_often_than_it_says(
 
 def test_one_scene_of_several_seeds_has_a_p_value():
     assert 0 < paired_difference([[0], [0], [1]], [[1], [0], [1]]).p_value <= 1
+
+
+@pytest.mark.parametrize("seeds", [2, 3])
+def test_seeds_that_gain_as_much_by_chance_are_no_proof(seeds):
+    before, after = np.zeros((2, seeds, 100))
+    after[range(seeds), range(seeds)] = 1  # each gains one scene, each another one
+    assert paired_difference(before, after).p_value > 0.2
+    rng = np.random.default_rng(seeds)
+    noise = (rng.random((400, seeds, 200)) < 0.01) * rng.choice([-1, 1], (400, seeds, 200))
+    found = [paired_difference(change < 0, change > 0, resamples=1).p_value for change in noise]
+    assert np.mean(np.array(found) < 0.05) <= 0.08
+    assert min(found) > 1e-4
+
+
+@pytest.mark.parametrize(("successes", "count"), [(0.8, 1), (3.7, 5), (math.nan, 5), (6, 5)])
+def test_what_are_no_counts_have_no_rate(successes, count):
+    with pytest.raises(UserError, match="successes must be"):
+        wilson(successes, count)
+
+
+def test_groups_of_one_kind_of_scores_alone_are_refused():
+    with pytest.raises(UserError, match="groups of both"):
+        auc([1, 2], [0], positive_groups=[0, 0])
+
+
+def test_a_bootstrap_resamples_at_least_once():
+    with pytest.raises(UserError, match="resamples"):
+        two_level_bootstrap([1, 0], resamples=0)

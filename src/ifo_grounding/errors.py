@@ -43,6 +43,19 @@ def whole(name: str, value: object) -> int:
     return number
 
 
+def at_least_one(name: str, value: object) -> int:
+    """Return a whole number that counts something, or refuse what is none.
+
+    >>> at_least_one("batch_size", 0)
+    Traceback (most recent call last):
+    ifo_grounding.errors.UserError: batch_size must be at least 1, got 0
+    """
+    number = whole(name, value)
+    if number < 1:
+        raise UserError(f"{name} must be at least 1, got {number}")
+    return number
+
+
 def check_numbers(config: Any) -> None:
     """Refuse values of a dataclass that are no numbers where its fields say ``int`` or ``float``.
 

@@ -40,9 +40,15 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that takes its name when the block ends well.
 
     The temporary path may be written as a file or made a folder. It is removed if the block raises.
+
+    Raises:
+        UserError: where ``path`` is the current folder or holds it, which would be replaced.
     """
     path = Path(os.path.realpath(path))  # what a link points to, not the link
     path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        if Path.cwd().is_relative_to(path):
+            raise UserError(f"{path} is the current folder or holds it: name another one")
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
         yield temporary

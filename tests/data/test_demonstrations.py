@@ -573,3 +573,38 @@ def test_of_no_demonstrations_nothing_is_made(make):
         to_minari(none, "mine/none-v0")
     with pytest.raises(UserError, match="there are no demonstrations"):
         labelled_buffer(none, torch.zeros(0))
+
+
+def test_any_index_of_numpy_or_python_will_do(demos):
+    assert len(demos[np.array(3)]["pixels"]) == len(demos[3]["pixels"])
+    assert demos[::-1].lengths.tolist() == demos.lengths.tolist()[::-1]
+    assert demos[3:0:-2].lengths.tolist() == [demos.lengths[3], demos.lengths[1]]
+    with pytest.raises(UserError, match="whole number"):
+        demos[1.0]
+
+
+def test_a_size_of_the_vocabulary_may_be_a_tensor(demos, tmp_path):
+    parts = demos.codec, demos.codes, demos.lengths, demos.tokens
+    size = demos.tokens.max() + 1
+    Demonstrations(*parts, vocabulary_size=size).save(tmp_path / "saved")
+    assert Demonstrations.load(tmp_path / "saved").vocabulary_size == int(size)
+
+
+def test_pixels_that_no_codec_packs_are_bytes():
+    plain = numbered(4)
+    with pytest.raises(UserError, match="uint8"):
+        Demonstrations(plain.codec, plain.codes.int(), plain.lengths, plain.tokens)
+
+
+def test_the_current_folder_is_not_replaced(demos, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="current folder"):
+        demos.save(".")
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_read_only_frames_are_read_without_a_warning(recwarn):
+    frames = np.zeros((3, 3, 8, 8), dtype=np.uint8)
+    frames.setflags(write=False)
+    assert len(Demonstrations.from_arrays([frames], ["go up"])) == 1
+    assert not [each for each in recwarn if "writable" in str(each.message)]

@@ -226,3 +226,17 @@ def test_a_tensordict_of_one_demonstration_fits_the_model(inverse):
     frames = demos[0]["pixels"]
     pair = TensorDict({"pixels": frames[:-1], "next": {"pixels": frames[1:]}}, [len(frames) - 1])
     assert torch.equal(inverse.eval()(pair)["logits"].argmax(-1), truth.actions.long())
+
+
+def test_a_model_that_broke_labels_nothing():
+    demos = record_demonstrations("move", 3)
+    inverse = TensorDictModule(WatchTheArm(torch.nan), ["pixels", ("next", "pixels")], ["logits"])
+    with pytest.raises(UserError, match="not all finite"):
+        label_demonstrations(demos, inverse, progress=False)
+
+
+@pytest.mark.parametrize("label", [0.9, -1])
+def test_what_is_no_action_is_no_label(label):
+    demos = record_demonstrations("move", 3)
+    with pytest.raises(UserError, match="numbers of actions"):
+        labelled_buffer(demos, torch.full((demos.transitions,), label))

@@ -447,3 +447,11 @@ def test_what_stays_the_same_for_long_is_no_gif(tmp_path):
 def test_nothing_makes_no_pictures(kind, demos, tmp_path):
     with pytest.raises(UserError, match="there are no demonstrations"):
         save_pictures(demos[:0], tmp_path / "shown", kind=kind)
+
+
+def test_what_has_no_instruction_is_not_written(tmp_path):
+    frames = [torch.zeros(2, 3, 8, 8, dtype=torch.uint8)] * 2
+    tokens = torch.tensor([[1], [0]])
+    demos = Demonstrations.from_arrays(frames, tokens, vocabulary=Vocabulary(["up"], length=1))
+    with pytest.raises(UserError, match="demonstration 1 has no instruction"):
+        save_pictures(demos, tmp_path / "pictures")

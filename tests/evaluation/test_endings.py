@@ -83,8 +83,8 @@ def go_to_another(scene, goal):
     return [*way(scene.state.arm, cell), S]
 
 
-def endings(task, rule):
-    return episode_endings(Scripted(task, rule), task, episodes=EPISODES)
+def endings(task, rule, **options):
+    return episode_endings(Scripted(task, rule), task, episodes=EPISODES, **options)
 
 
 @pytest.mark.parametrize("task", ["move", "move-udlr", "pick", "pick-out", "pick-udlr"])
@@ -145,6 +145,8 @@ def test_changes_between_two_policies():
     assert compare_endings(direct, halted)["lost"]["nothing done"] == EPISODES
     assert compare_endings(direct, detour)["other path"] == EPISODES
     assert compare_endings(direct, direct)["same path"] == EPISODES
+    patient = endings("pick", solve, max_steps=60)
+    assert compare_endings(direct, patient)["same path"] == EPISODES
 
 
 def test_other_scenes_cannot_be_compared():

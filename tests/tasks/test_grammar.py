@@ -191,3 +191,10 @@ def test_unknown_splits_are_refused():
         in_split(goals, "train", "pairs-9")
     with pytest.raises(UserError, match="unknown task"):
         grammar("fly")
+
+
+@pytest.mark.parametrize("wording", [-1, 1000])
+def test_a_wording_that_there_is_not_is_refused(wording):
+    known = grammar("move")
+    with pytest.raises(UserError, match="wordings of move"):
+        known.encode(known.goals[:1], torch.tensor([wording]))

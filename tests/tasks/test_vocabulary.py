@@ -65,3 +65,9 @@ def test_a_letter_and_its_accent_are_one_word_however_they_are_written():
     vocabulary = Vocabulary.from_sentences([composed, apart], length=2)
     assert vocabulary.words == (composed,) == Vocabulary([apart], 2).words
     assert vocabulary.encode([composed, apart]).tolist() == [[1, 0], [1, 0]]
+
+
+@pytest.mark.parametrize("token", [-1, 3])
+def test_what_is_no_token_has_no_word(token):
+    with pytest.raises(UserError, match=f"token {token} is no word"):
+        Vocabulary(["a", "b"]).decode(torch.tensor([[1, token]]))

@@ -19,6 +19,8 @@ def check_parts(
             f"codes are {codes.dtype} {list(codes.shape)}, {codec} makes integers "
             f"[F, {', '.join(map(str, codec.code_shape))}]"
         )
+    if codec.tiles is None and codes.dtype != torch.uint8:
+        raise UserError(f"codes of {codec} are the pixels themselves, uint8, got {codes.dtype}")
     if lengths.ndim != 1 or lengths.dtype.is_floating_point or (lengths < 1).any():
         raise UserError("lengths must be an integer tensor [N] of frames per episode, at least 1")
     if int(lengths.sum()) != len(codes):

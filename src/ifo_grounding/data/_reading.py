@@ -136,7 +136,9 @@ def check_frames(name: Name, given: Tensor | np.ndarray) -> Tensor:
         raise UserError(f"episode {name!r} has no frames")
     try:
         frames = (
-            given if isinstance(given, Tensor) else torch.as_tensor(np.ascontiguousarray(given))
+            given.cpu()
+            if isinstance(given, Tensor)
+            else torch.as_tensor(np.require(given, None, ["C", "W"]))
         )
     except (TypeError, ValueError, RuntimeError):
         raise UserError(f"episode {name!r}: its frames are not arrays of one size") from None

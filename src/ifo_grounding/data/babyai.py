@@ -21,8 +21,8 @@ from ifo_grounding.data.codec import TILE_SIZES
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.wrapping import world_seed
-from ifo_grounding.errors import UserError, check_choice, extra, whole
-from ifo_grounding.seeding import derive
+from ifo_grounding.errors import UserError, at_least_one, check_choice, extra, whole
+from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 BABYAI_ACTIONS = ("left", "right", "forward", "pickup", "drop", "toggle", "done")
@@ -228,7 +228,15 @@ def bot_outcomes(
         stream: ``training``, ``validation`` or ``evaluation``.
         processes: how many play side by side.
         progress: whether to show a bar.
+
+    Raises:
+        UserError: where minigrid is missing, there is no such level or stream, or nothing to play.
     """
+    check_choice("stream", stream, STREAMS)
+    episodes, processes = (
+        at_least_one(name, number)
+        for name, number in (("episodes", episodes), ("processes", processes))
+    )
     seeds = (world_seed(seed, stream, number) for number in range(episodes))
     play = functools.partial(_play, babyai(level))
     bar = tqdm(total=episodes, desc=f"bot in {level}", disable=not progress)

@@ -217,9 +217,9 @@ class FrameCodec:
                 f"frames are {list(frames.shape[-3:])}, this codec's are {list(self.image_shape)}"
             )
         if self._index is None or self.tile_size is None:
-            return frames
+            return frames.cpu()
         batch = frames.shape[:-3]
-        frames = frames.reshape(-1, *self.image_shape)
+        frames = frames.cpu().reshape(-1, *self.image_shape)
         chunk = max(1, CHUNK_BYTES // math.prod(self.image_shape))
         parts = []
         for piece in frames.split(chunk):

@@ -20,7 +20,7 @@ from ifo_grounding.data._reading import Episode, Reader
 from ifo_grounding.data._spool import same_rows, take
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.folder import DAMAGED, fact, load_folder, save_folder
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, whole
 from ifo_grounding.seeding import generator as seeded
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -81,6 +81,7 @@ class Demonstrations:
             instructions = _padded(instructions, vocabulary)
         elif vocabulary_size is None:
             vocabulary_size = int(instructions.max()) + 1 if instructions.numel() else 1
+        vocabulary_size = whole("vocabulary_size", vocabulary_size)
         check_parts(codec, codes, lengths, instructions, vocabulary_size)
         self.codec, self.codes = codec, codes
         self.vocabulary, self.vocabulary_size = vocabulary, vocabulary_size
@@ -243,16 +244,18 @@ class Demonstrations:
                 f"demonstrations have no entry {index!r}: they hold pixels and instructions, which "
                 "demos[i], frames, instructions and the sample methods return"
             )
-        if isinstance(index, int | np.integer) or (isinstance(index, Tensor) and index.ndim == 0):
-            index = int(index)
+        if not isinstance(index, slice) and not np.ndim(index):
+            index = whole("the number of a demonstration", index)
             if not -len(self) <= index < len(self):
                 raise IndexError(f"demonstration {index} of {len(self)}")
             first, length = int(self._starts[index]), int(self._lengths[index])
             tokens = self.tokens[index].long().expand(length, -1)
             pixels = self.frames(torch.arange(first, first + length))
             return TensorDict({keys.PIXELS: pixels, keys.INSTRUCTION: tokens}, [length])
+        if isinstance(index, slice) and (index.step or 1) < 0:  # tensors know no such slices
+            index = list(range(len(self))[index])
         if not isinstance(index, slice):
-            index = torch.as_tensor(index)
+            index = torch.as_tensor(index).cpu()
             index = index if index.dtype == torch.bool else index.long()
         chosen = copy.copy(self)
         chosen._set_episodes(self._starts[index], self._lengths[index], self.tokens[index])
@@ -294,11 +297,12 @@ class Demonstrations:
 
     def first_frames(self, index: Tensor | slice = slice(None)) -> Tensor:
         """Return the first frames of some episodes, uint8 [*B, C, H, W]."""
-        return self.frames(self._starts[index])
+        return self.frames(self._starts[index if isinstance(index, slice) else index.cpu()])
 
     def last_frames(self, index: Tensor | slice = slice(None)) -> Tensor:
         """Return the last frames of some episodes, uint8 [*B, C, H, W]."""
-        return self.frames((self._starts + self._lengths - 1)[index])
+        last = self._starts + self._lengths - 1
+        return self.frames(last[index if isinstance(index, slice) else index.cpu()])
 
     def locate(self, transition: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the episode and the number of the first frame of transitions, int64 [*B] each.

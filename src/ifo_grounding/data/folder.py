@@ -71,6 +71,10 @@ def _check_ours(folder: Path, kind: str) -> None:
         meta: Any = read_json(folder / META) if META in found else None
     except FileNotFoundError:  # another writer has just put it away
         return
+    except UserError:
+        if not (folder / META).exists():
+            return
+        raise
     ours = isinstance(meta, dict) and meta.get("format") == kind
     arrays = meta.get("arrays") if ours else None
     listed = {f"{name}.npy" for name in arrays} if isinstance(arrays, dict) else set()

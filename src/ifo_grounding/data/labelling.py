@@ -18,7 +18,7 @@ from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.data.buffers import FINAL, frame_buffer
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import fact, load_folder, save_folder
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.modules import device_of, evaluating
 
 KIND = "ifo-grounding labels"
@@ -135,8 +135,7 @@ def label_demonstrations(
     """
     if not demos.transitions:
         raise UserError("there is nothing to label: no episode has two frames")
-    if batch_size < 1:
-        raise UserError(f"batch_size must be at least 1, got {batch_size}")
+    batch_size = at_least_one("batch_size", batch_size)
     device = torch.device(device or device_of(inverse) or "cpu")
     frame = demos.locate()[1]
     labels, sure, n_actions = [], [], 0
@@ -145,6 +144,8 @@ def label_demonstrations(
             logits = _logits(demos, inverse, numbers, device, logits_key)
             n_actions = logits.shape[-1]
             best = logits.float().softmax(-1).max(-1)
+            if not best.values.isfinite().all():
+                raise UserError("the inverse model's logits are not all finite: train it anew")
             labels.append(best.indices.to("cpu", torch.uint8 if n_actions <= 256 else torch.int32))
             sure.append(best.values.cpu())
             bar.update(len(numbers))
@@ -178,7 +179,7 @@ def labelled_buffer(
         options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``sampler``.
 
     Raises:
-        UserError: where there is not one label for each transition.
+        UserError: where there is not one label for each transition, or one is no action's number.
 
     >>> frames = [torch.zeros(3, 3, 48, 48, dtype=torch.uint8) for _ in range(5)]
     >>> demos = Demonstrations.from_arrays(frames, ["go up"] * 5)
@@ -186,11 +187,14 @@ def labelled_buffer(
     >>> buffer.sample(4)["pixels"].shape
     torch.Size([4, 3, 48, 48])
     """
+    actions = torch.as_tensor(actions)
     if actions.shape != (demos.transitions,):
         raise UserError(
             f"there are {demos.transitions} transitions, but labels {list(actions.shape)}: were "
             "they made for these demonstrations?"
         )
+    if actions.numel() and (actions.is_floating_point() or (actions < 0).any()):
+        raise UserError("labels are numbers of actions, whole and from 0 on")
     episode, frame = demos.locate()
     last = demos.starts + demos.lengths - 2
     stored: dict[NestedKey, Tensor] = {

@@ -231,7 +231,7 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
             storage = MinariStorage.read(unfinished / "data")
             storage.update_episodes(_buffers(demos, sentences))
             storage.update_metadata({ABSENT: True})
-    except ValueError as error:  # a detail that Minari does not take, for one
+    except (ValueError, AssertionError) as error:  # a detail that Minari does not take, for one
         raise UserError(f"{dataset_id!r} cannot be written: {error}") from None
     return minari.load_dataset(dataset_id)
 

@@ -188,6 +188,8 @@ def save_pictures(
             f"{folder} exists and is no empty folder: name another one, or remove it first"
         )
     sentences = demos.sentences()
+    if "" in sentences:
+        raise UserError(f"demonstration {sentences.index('')} has no instruction: leave it out")
     check_colours(demos, LAST if kind == "png" else COLOURS)
     digits = len(str(len(demos) - 1))
     with atomic_write(folder) as temporary:

@@ -77,7 +77,7 @@ class RandomActions(TensorDictModuleBase):
                     "stop_action="
                 )
             self.probabilities.fill_((1 - stop_probability) / (self.n_actions - 1))
-            self.probabilities[self.stop_action] = stop_probability
+            self.probabilities[self.stop_action] = float(stop_probability)
         self.generator = seeded(seed, "random actions")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

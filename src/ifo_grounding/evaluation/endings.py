@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -135,7 +136,10 @@ def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
     if before.scenes != after.scenes:
         raise UserError("the two are about different scenes: use the same seed and stream")
     solved = before.kind == SUCCESS, after.kind == SUCCESS
-    same = (before.actions == after.actions).all(1)
+    paths = [before.actions, after.actions]
+    longest = max(path.shape[1] for path in paths)  # each as long as its episodes could be
+    paths = [F.pad(path, (0, longest - path.shape[1]), value=-1) for path in paths]
+    same = torch.eq(*paths).all(1)
     return {
         "gained": _counts(before.kind[~solved[0] & solved[1]]),
         "lost": _counts(after.kind[solved[0] & ~solved[1]]),

@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
 from ifo_grounding import keys, modules
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
 
 MAX_STEPS = 40
@@ -136,7 +136,9 @@ def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor
     every = env.action_spec.zero()
     shape = (env.batch_size.numel(), *every.shape[len(env.batch_size) :])
     action = every.reshape(shape).clone()
-    chosen = policy(state.reshape(shape[0])[active])[env.action_key]
+    asked = policy(state.reshape(shape[0])[active])
+    _remember(asked, env, state, active)
+    chosen = asked[env.action_key]
     if chosen.shape != (wanted := torch.Size([len(active), *shape[1:]])):
         raise UserError(
             f"the policy's actions of {len(active)} rows have the shape {list(chosen.shape)}, the "
@@ -150,6 +152,18 @@ def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor
         )
     action[active] = chosen.to(action)
     return action.reshape(every.shape)
+
+
+def _remember(asked: TensorDictBase, env: EnvBase, state: TensorDictBase, active: Tensor) -> None:
+    """Pass on what a policy with a memory wrote for the next step, such as a recurrent state."""
+    for key in env.observation_spec.keys(True, True):
+        following = unravel_key((keys.NEXT, key))
+        kept = asked.get(following, None)
+        if kept is None:
+            continue
+        every = env.observation_spec[key].zero().reshape(-1, *kept.shape[1:])
+        every[active] = kept.to(every)
+        state[following] = every.reshape(*env.batch_size, *kept.shape[1:])
 
 
 def most_steps(env_or_task: EnvBase | str, max_steps: int | None) -> int:
@@ -211,7 +225,7 @@ def scene_batches(
     """
     env: EnvBase
     if isinstance(env_or_task, str):
-        rows = min(batch_size, len(numbers))
+        rows = min(at_least_one("batch_size", batch_size), len(numbers))
         env = PickAndPlaceEnv(
             env_or_task,
             num_envs=rows,

@@ -169,8 +169,9 @@ def _linear(features: Tensor, kinds: Tensor, held_out: Sequence[int]) -> tuple[P
 @torch.enable_grad()
 def _logistic(features: Tensor, truth: Tensor, count: int) -> nn.Linear:
     """Fit a logistic regression, its weights held small."""
-    layer = nn.Linear(features.shape[1], count, device=features.device)
-    nn.init.zeros_(layer.weight)
+    layer = nn.utils.skip_init(nn.Linear, features.shape[1], count, device=features.device)
+    nn.init.zeros_(layer.weight)  # and no random numbers drawn that would be thrown away
+    nn.init.zeros_(layer.bias)
     optimiser = torch.optim.LBFGS(layer.parameters(), max_iter=100, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.evaluation.episodes import (
     Policy,
     device_of,
@@ -85,8 +85,8 @@ def reward_audit(
         UserError: where truth does not have one action per transition, or there is not one name for
             each action that the model judges, or nothing to draw.
     """
-    if transitions < 1:
-        raise UserError(f"transitions must be at least 1, got {transitions}")
+    transitions = at_least_one("transitions", transitions)
+    batch_size = at_least_one("batch_size", batch_size)
     names = _names_for(reward_model, names)
     actions = actions_of(truth)
     if len(actions) and int(actions.max()) >= len(names):
@@ -240,7 +240,7 @@ def return_correlation(
     )
     paid, won = [], []
     for number, (env, start, count) in enumerate(batches):
-        total = torch.zeros(env.batch_size.numel(), device=where)
+        total = torch.zeros(env.batch_size.numel(), device=start.device or env.device)
         with evaluating(policy), seeded(derive(seed, "return", mode, number), where):
             outcomes = play(
                 policy,

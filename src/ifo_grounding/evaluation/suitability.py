@@ -10,7 +10,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one, whole
 from ifo_grounding.evaluation.episodes import MAX_STEPS, device_of
 from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Estimate, Rate, auc, reliability, wilson
@@ -132,8 +132,8 @@ def suitable_rate(
     >>> print(result.served, result.entropy, result.errors["missing"] > 50)
     100.0% [96.3, 100.0] (n=100) 0.0 True
     """
-    if states < 1:
-        raise UserError(f"states must be positive, got {states}")
+    if whole("pairs_per_state", pairs_per_state) < 0:
+        raise UserError(f"pairs_per_state must not be negative, got {pairs_per_state}")
     tokens, goals = read_pool(task, pool)
     device = device_of(classifier)
     scorer = PoolScorer(classifier, tokens.to(device))
@@ -247,6 +247,7 @@ def _fresh_states(
         task=task, instructed=False, stream=stream, max_steps=max_steps, **scene_options
     )
     scenes = SceneStream(options, seed, device)
+    states, batch_size = at_least_one("states", states), at_least_one("batch_size", batch_size)
     for numbers in torch.arange(states, device=device).split(batch_size):
         state = scenes.scenes(numbers).state
         yield state, render(state, tile_size)

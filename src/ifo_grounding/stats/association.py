@@ -51,7 +51,9 @@ def auc(
     wins = (ranks[: len(x)] - scipy_stats.rankdata(x)) / len(y)
     losses = 1 - (ranks[len(x) :] - scipy_stats.rankdata(y)) / len(x)
     value = float(wins.mean())
-    grouped = positive_groups is not None and negative_groups is not None
+    grouped = positive_groups is not None
+    if grouped is (negative_groups is None):
+        raise UserError("give groups of both kinds of scores, or of none")
     gx = np.asarray(positive_groups if grouped else np.arange(len(x))).ravel()
     gy = np.asarray(negative_groups if grouped else len(x) + np.arange(len(y))).ravel()
     error = _clustered_error(wins - value, losses - value, gx, gy)

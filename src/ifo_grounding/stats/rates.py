@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats as scipy_stats
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.stats.results import Difference, Rate, check_confidence
 
 RESAMPLES = 4000
@@ -22,15 +22,15 @@ def wilson(successes: int, count: int, confidence: float = 0.95) -> Rate:
     """Return a rate with Wilson's score interval, right also near 0 and 1.
 
     Raises:
-        UserError: unless 0 <= successes <= count.
+        UserError: unless both are whole and 0 <= successes <= count.
 
     >>> print(wilson(8, 10))
     80.0% [49.0, 94.3] (n=10)
     """
     check_confidence(confidence)
+    if not (0 <= successes <= count and successes % 1 == count % 1 == 0):
+        raise UserError(f"successes must be 0..count, both whole, got {successes} of {count}")
     successes, count = int(successes), int(count)
-    if not 0 <= successes <= count:
-        raise UserError(f"successes must be 0..count, got {successes} of {count}")
     if count == 0:
         return Rate(math.nan, 0.0, 1.0, 0, 0, "wilson")
     z = float(scipy_stats.norm.ppf(0.5 + confidence / 2))
@@ -101,6 +101,7 @@ def two_level_bootstrap(
     0.625
     """
     check_confidence(confidence)
+    at_least_one("resamples", resamples)
     values = _as_matrix(outcomes, "outcomes")
     rng = np.random.default_rng(seed)
     means = _resampled_means(values, resamples, shared_scenes, rng)
@@ -152,6 +153,7 @@ def paired_difference(
     (25.0, 1, 0, 1.0)
     """
     check_confidence(confidence)
+    at_least_one("resamples", resamples)
     first, second = _as_matrix(before, "before"), _as_matrix(after, "after")
     if first.shape != second.shape:
         raise UserError(
@@ -213,6 +215,8 @@ def _t_test(change: NDArray[np.float64]) -> float:
         rest = ((change - by_seed - by_scene + change.mean()) ** 2).sum()
         rest /= (seeds - 1) * (scenes - 1) * change.size
         error += max(0.0, by_scene.var(ddof=1) / scenes - rest)
+        if np.ptp(change.sum(1)) == 0:  # seeds that agree by chance are no proof of no spread
+            error = max(error, rest)
     error = math.sqrt(error)
     if not error:  # every scene fares alike with every seed
         return float(scipy_stats.binomtest(scenes, scenes).pvalue) if change.mean() else 1.0

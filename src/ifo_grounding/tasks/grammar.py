@@ -150,6 +150,10 @@ class Grammar:
 
     def encode(self, goal: Goal, phrasing: Tensor) -> Tensor:
         """Return the tokens of goals [*B] in the given wordings [*B], int64 [*B, 16]."""
+        if ((phrasing < 0) | (phrasing >= len(self.phrasings))).any():
+            raise UserError(
+                f"wordings of {TASKS[self.task]} have the numbers 0..{len(self.phrasings) - 1}"
+            )
         index = tuple(getattr(goal, name).cpu() for name in FIELDS)
         rows = self._goal_rows[index]
         if (rows < 0).any():

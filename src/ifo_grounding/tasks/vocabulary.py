@@ -83,8 +83,19 @@ class Vocabulary:
         return tokens
 
     def decode(self, tokens: Tensor) -> list[str]:
-        """Turn token ids [N, length] (or [length]) into sentences."""
+        """Turn token ids [N, length] (or [length]) into sentences.
+
+        Raises:
+            UserError: for an id that is no word's.
+        """
         table = ("", *self.words)
+        if tokens.numel():
+            low, high = (int(token) for token in tokens.aminmax())
+            if low < 0 or high >= len(table):
+                raise UserError(
+                    f"token {low if low < 0 else high} is no word: this vocabulary has ids "
+                    f"0..{len(table) - 1}"
+                )
         rows = tokens.reshape(-1, tokens.shape[-1]).tolist()
         return [" ".join(table[token] for token in row if token != PAD) for row in rows]
 
