@@ -59,11 +59,16 @@ def at_least_one(name: str, value: object) -> int:
 def check_numbers(config: Any) -> None:
     """Refuse values of a dataclass that are no numbers where its fields say ``int`` or ``float``.
 
+    Those of NumPy and PyTorch become Python's, which a checkpoint can hold.
+
     Raises:
         UserError: with the name of the first of them.
     """
     for field in fields(config):
         value = getattr(config, field.name)
+        if field.type in ("int", "int | None", "float") and getattr(value, "shape", None) == ():
+            value = value.item()
+            object.__setattr__(config, field.name, value)  # of a frozen one, too
         if field.type == "int" or (field.type == "int | None" and value is not None):
             whole(field.name, value)
         elif field.type == "float" and (

@@ -471,7 +471,7 @@ def test_torchrl_wraps_many_worlds():
         ({"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
         ({"render_mode": "ascii"}, "unknown render mode 'ascii'"),
         ({"split": "x"}, "unknown split 'x'"),
-        ({"max_steps": 0}, "max_steps must be positive"),
+        ({"max_steps": 0}, "max_steps must be at least 1"),
     ],
 )
 def test_bad_arguments_are_refused(kind, wrong, said):

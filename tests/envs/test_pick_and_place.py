@@ -477,11 +477,13 @@ def test_render_draws_every_world_large():
     [
         ({"task": "fly"}, "unknown task 'fly': choose one of 'move', 'move-udlr'"),
         ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
+        ({"num_envs": 2.0}, "num_envs must be a whole number, got 2.0"),
+        ({"max_steps": 2.5}, "max_steps must be a whole number, got 2.5"),
         ({"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
         ({"split": "test"}, "unknown split 'test'"),
         ({"holdout": "x"}, "unknown holdout 'x': choose one of 'pairs-1'"),
         ({"stream": "x"}, "unknown stream 'x': choose one of 'training'"),
-        ({"max_steps": 0}, "max_steps must be positive"),
+        ({"max_steps": 0}, "max_steps must be at least 1"),
     ],
 )
 def test_bad_arguments_are_refused(wrong, said):

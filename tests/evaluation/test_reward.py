@@ -172,3 +172,19 @@ def test_a_goal_judge_is_shown_the_first_and_the_last_frame(make_expert):
     )
     assert torch.allclose(audit.returns, audit.outcomes.float(), atol=1e-6)
     assert audit.correlation.value == pytest.approx(1.0)
+
+
+def test_arrival_is_paid_once():
+    """Where practice would end the episode; here the policy wanders on."""
+    judge = TensorDictModule(
+        lambda first, last, words: 40.0 * (first != last).flatten(1).any(1, keepdim=True) - 20.0,
+        ["initial_pixels", "pixels", "instruction"],
+        ["goal_score"],
+    )
+
+    def up(td):
+        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
+
+    pay = LearnedReward(judge, kind="goal", arrival=0.9)
+    audit = return_correlation(up, pay, "move", episodes=40, max_steps=5)
+    assert set(audit.returns.round(decimals=5).tolist()) == {0.0, 1.0}

@@ -214,7 +214,7 @@ def test_environments_of_other_batch_shapes():
         (lambda p: success_rate(p, "fly"), "unknown task 'fly'"),
         (lambda p: success_rate(p, "move", mode="best"), "unknown mode 'best'"),
         (lambda p: success_rate(p, "move", stream="test"), "unknown stream 'test'"),
-        (lambda p: success_rate(p, "move", episodes=0), "must be positive"),
+        (lambda p: success_rate(p, "move", episodes=0), "must be at least 1"),
         (lambda p: success_rate(p, PickAndPlaceEnv(instructed=False)), "instructed"),
         (lambda p: success_rate(p, PickAndPlaceEnv(), tile_size=8), "tile_size"),
     ],

@@ -135,7 +135,7 @@ def test_choices_to_look_at_are_those_that_count():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"states": 0}, "states must be positive"),
+        ({"states": 0}, "states must be at least 1"),
         ({"pool": []}, "pool is empty"),
         ({"pool": ["put the red circle in the orange box"]}, "no sentence of move"),
         ({"task": "fly"}, "unknown task"),

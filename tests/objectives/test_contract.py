@@ -189,3 +189,13 @@ def test_it_learns_a_small_batch_by_heart(kind):
     checked = loss.eval()(data)
     assert float(total(checked).detach()) < 0.15 * first
     assert float(checked.get("accuracy", torch.ones(()))) == 1
+
+
+def test_its_outputs_can_be_selected(kind):
+    loss = make_loss(kind)
+    every = list(loss.out_keys)
+    name = next(key for key in every if key.startswith("loss_"))
+    loss.select_out_keys(name)
+    assert list(loss(batch()).keys()) == [name] == list(loss.out_keys)
+    loss.reset_out_keys()
+    assert list(loss(batch()).keys()) == every == list(loss.out_keys)

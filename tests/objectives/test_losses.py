@@ -538,3 +538,23 @@ def test_judges_learn_actions_of_another_name():
         assert loss.in_keys == ["pixels", "instruction", name]
         losses.append(loss(some_steps(name))["loss_reward"])
     assert losses[0] == losses[1]
+
+
+def test_adversarial_training_leaves_out_padding():
+    loss = make_loss("reward")
+    steps, others = batch((4, 3)), batch((2, 3), seed=1)
+    real = torch.tensor([[1, 1, 1], [1, 0, 0]]).bool()
+    padded = others.clone().set(("collector", "mask"), real)
+    out, expected = loss.eval().adversarial(steps, padded), loss.adversarial(steps, others[real])
+    torch.testing.assert_close(out.to_dict(), expected.to_dict())
+    assert out["negative_probability"] != loss.adversarial(steps, others)["negative_probability"]
+
+
+def test_imitation_can_be_mapped_over_batches():
+    loss, steps = make_loss("imitation").eval(), batch((3, 5))
+
+    def one(*parts):
+        return loss(TensorDict(dict(zip(loss.in_keys, parts, strict=True)), [5]))["loss_imitation"]
+
+    found = torch.vmap(one)(*(steps[key] for key in loss.in_keys))
+    torch.testing.assert_close(found, torch.stack([loss(row)["loss_imitation"] for row in steps]))

@@ -198,7 +198,7 @@ def test_bad_requests_are_refused(monkeypatch):
         SceneOptions(stream="x")
     with pytest.raises(UserError, match="unknown holdout 'x'"):
         SceneOptions(holdout="x")
-    with pytest.raises(UserError, match="max_steps must be positive"):
+    with pytest.raises(UserError, match="max_steps must be at least 1"):
         SceneOptions(max_steps=0)
     with pytest.raises(UserError, match="start at 0"):
         SceneStream(SceneOptions(), 0).scenes(torch.tensor([-1]))

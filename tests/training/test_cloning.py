@@ -1,12 +1,14 @@
 import pytest
 import torch
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import make_goal_judge, make_instruction_classifier, make_policy
+from ifo_grounding.seeding import derive
 from ifo_grounding.training import accepted, accepted_steps
+from ifo_grounding.training.environment import make_collector, reseed
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 
 
@@ -42,3 +44,26 @@ def test_a_judge_that_accepts_nothing_is_an_error():
     env, policy = practice(-50.0)
     with pytest.raises(UserError, match="accepted no episode"):
         accepted_steps(env, policy, iterations=1, steps=15, seed=0)
+
+
+def test_worlds_in_workers_are_as_those_side_by_side():
+    def world(seed):
+        return PickAndPlaceEnv("move", num_envs=3, seed=seed, instructed=False)
+
+    _, policy = practice(0.0)
+    judge = make_goal_judge(world(0), features=16, n_blocks=1, seed=0)
+    judge.module.prior.fill_(50.0)  # a goal is reached whenever the policy stops
+    classifier = make_instruction_classifier(world(0), features=16, n_blocks=1, seed=0)
+    sampler = InstructionSampler(classifier, torch.randint(1, 20, (4, 16)), threshold=0.0)
+    workers = SerialEnv(2, [lambda: world(0), lambda: world(1)])
+    env = TransformedEnv(workers, Compose(sampler, LearnedReward(judge, "goal", stop_action=5)))
+    steps = accepted_steps(env, policy, iterations=1, steps=10, seed=0)
+
+    batches = iter(make_collector(env, policy, 10))
+    reseed(env, derive(0, "accepted steps", 0))
+    batch = next(batches)
+    expected = []
+    for row in batch.reshape(-1, 10):
+        stops = (row["action"] == 5).nonzero().flatten().tolist()
+        expected.append(row["action"][: max(stops, default=-1) + 1])
+    assert torch.equal(steps["action"], torch.cat(expected))

@@ -4,7 +4,10 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from ifo_grounding.data import first_frame_buffer, record_demonstrations
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks import make_instruction_classifier
+from ifo_grounding.objectives import InstructionLoss
 from ifo_grounding.training import FitConfig, HeldOut, fit
 
 
@@ -66,6 +69,17 @@ def test_a_look_leaves_mode_and_randomness_alone():
     HeldOut(loss, buffer([1.0])).look()
     assert loss.training
     assert torch.equal(state, torch.random.get_rng_state())
+
+
+def test_a_look_leaves_the_network_and_generators_of_its_own_alone():
+    demos = record_demonstrations("move", 20, seed=0)
+    classifier = make_instruction_classifier(demos, "film", seed=0).eval()
+    generator = torch.Generator().manual_seed(7)
+    loss = InstructionLoss(classifier, demos.pool(), generator=generator)
+    held_out = HeldOut(loss, first_frame_buffer(demos))
+    assert held_out.look() == held_out.look()
+    assert not classifier.training
+    assert torch.equal(generator.get_state(), torch.Generator().manual_seed(7).get_state())
 
 
 def test_nothing_held_out_is_refused():

@@ -102,6 +102,15 @@ def test_a_policy_learns_what_the_judge_likes(algorithm):
     assert history[-1]["learned_reward"] > 0.6
 
 
+def test_a_value_may_write_under_any_name():
+    found = []
+    for name in ("state_value", "worth"):
+        env, policy = make_env(likes(1)), make_policy(simulator(1), **SMALL)
+        value = make_value(simulator(1), init_from=policy, out_key=name, **SMALL)
+        found.append(self_examine(env, policy, value, config(), seed=0))
+    assert found[0][-1]["loss_critic"] == found[1][-1]["loss_critic"]
+
+
 def test_rehearsal_keeps_what_the_demonstrations_show():
     """Demonstrations that always take action 3 hold against a judge that likes action 1."""
     demos = TensorDictReplayBuffer(storage=LazyTensorStorage(64))

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -216,3 +217,14 @@ def test_only_losses_are_minimised():
 def test_what_cannot_be_sampled_is_refused():
     with pytest.raises(UserError, match="got list: demonstrations become one by labelled_buffer"):
         fit(torch.nn.Linear(1, 1), [1, 2], FitConfig(steps=1), seed=0)
+
+
+def test_numbers_of_numpy_do_not_break_a_checkpoint(buffer, tmp_path):
+    config = FitConfig(
+        steps=np.int64(4), batch_size=8, iteration=2, lr=np.logspace(-3, -2, 2)[0], evaluate_every=1
+    )
+    options = {"seed": 0, "checkpoint": tmp_path / "run.pt"}
+    options["callback"] = lambda step: {"success": np.mean([0.0, 1.0])}
+    fit(imitation(), buffer, config, until=2, **options)
+    history = fit(imitation(), buffer, config, **options)
+    assert [row["success"] for row in history] == [0.5, 0.5]

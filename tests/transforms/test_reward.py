@@ -335,3 +335,16 @@ def test_the_instruction_may_be_chosen_by_a_later_transform():
 
     sampler, reward = InstructionSampler(classifier(), POOL), LearnedReward(action_judge())
     assert torch.equal(paid(reward, sampler), paid(reward.clone(), sampler.clone()))
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_what_a_composed_transform_changes_is_refused(inside):
+    later = Compose(ToTensorImage(in_keys=["pixels"], shape_tolerant=True))
+    reward = Compose(LearnedReward(action_judge())) if inside else LearnedReward(action_judge())
+    with pytest.raises(UserError, match=r"after LearnedReward changes \['pixels'\]"):
+        make(reward).append_transform(later).rollout(2)
+
+
+def test_no_steps_are_paid_nothing():
+    steps = make(LearnedReward(action_judge())).rollout(3)[:, :0]
+    assert LearnedReward(action_judge())(steps)["next", "learned_reward"].shape == (6, 0, 1)

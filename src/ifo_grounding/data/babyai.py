@@ -21,7 +21,7 @@ from ifo_grounding.data.codec import TILE_SIZES
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.wrapping import world_seed
-from ifo_grounding.errors import UserError, at_least_one, check_choice, extra, whole
+from ifo_grounding.errors import UserError, at_least_one, check_choice, extra
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -174,8 +174,7 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
     Raises:
         UserError: where minigrid is missing, there is no such level, or the bot fails too often.
     """
-    if whole("n", n) < 1 or whole("processes", processes) < 1:
-        raise UserError(f"n and processes must be at least 1, got {n} and {processes}")
+    n, processes = at_least_one("n", n), at_least_one("processes", processes)
     play = functools.partial(_play, babyai(level, tile_size))
     name = f"{level.removeprefix('BabyAI-').removesuffix('-v0')} {stream}"
     seeds = (derive(seed, "babyai", name, number) % 2**31 for number in range(PATIENCE * n))
@@ -233,10 +232,7 @@ def bot_outcomes(
         UserError: where minigrid is missing, there is no such level or stream, or nothing to play.
     """
     check_choice("stream", stream, STREAMS)
-    episodes, processes = (
-        at_least_one(name, number)
-        for name, number in (("episodes", episodes), ("processes", processes))
-    )
+    episodes, processes = at_least_one("episodes", episodes), at_least_one("processes", processes)
     seeds = (world_seed(seed, stream, number) for number in range(episodes))
     play = functools.partial(_play, babyai(level))
     bar = tqdm(total=episodes, desc=f"bot in {level}", disable=not progress)

@@ -19,7 +19,7 @@ from ifo_grounding.data._reading import BROKEN, COLOURS, LAST, MODES, naming, st
 from ifo_grounding.data._video import read_video, write_video
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.listing import LIST, VIDEOS, Listed, read_list
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.files import atomic_write
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -179,8 +179,7 @@ def save_pictures(
             kind is unknown, or images do not fit it.
     """
     check_choice("kind", kind, FORMATS)
-    if scale < 1:
-        raise UserError(f"scale must be at least 1, got {scale}")
+    scale = at_least_one("scale", scale)
     refuse_empty(len(demos))
     folder = Path(folder)
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):

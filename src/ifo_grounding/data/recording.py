@@ -13,7 +13,7 @@ from tqdm import tqdm
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
-from ifo_grounding.errors import UserError, check_choice, whole
+from ifo_grounding.errors import at_least_one, check_choice
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
 from ifo_grounding.tasks.goals import MAX_STEPS
@@ -79,8 +79,7 @@ def record_demonstrations(  # type: ignore[misc]  # the overloads leave options 
     Demonstrations(20 episodes, ... frames, FrameCodec(3x48x48, ... tiles of 8))
     """
     check_choice("tile size", tile_size, TILE_SIZES)
-    if whole("the number of demonstrations", n) < 1:
-        raise UserError(f"the number of demonstrations must be at least 1, got {n}")
+    n = at_least_one("the number of demonstrations", n)
     options = SceneOptions(
         task=task,
         split=split,

@@ -21,7 +21,7 @@ from ifo_grounding.attributes import STOP_ACTION, attribute, says_stop
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import DAMAGED, fact, load_folder, save_folder
-from ifo_grounding.errors import UserError, whole
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
@@ -212,8 +212,7 @@ def collect_transitions(
     >>> int(report.taken.sum()), len(buffer) == int(report.kept.sum())
     (64, True)
     """
-    if whole("n", n) < 1:
-        raise UserError(f"n must be at least 1 step, got {n}")
+    n = at_least_one("n", n)
     if drop_unchanged and stop_action is None and not says_stop(env):
         raise UserError(
             "the environment does not say which action is its stop, whose unchanged frames are "

@@ -11,7 +11,7 @@ import torch
 
 from ifo_grounding import keys
 from ifo_grounding.envs.simulator import Simulator
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
@@ -58,8 +58,7 @@ def make_simulator(
         TypeError: on an unknown scene option.
     """
     check_choice("tile size", tile_size, TILE_SIZES)
-    if num_envs < 1:
-        raise UserError(f"num_envs must be at least 1, got {num_envs}")
+    num_envs = at_least_one("num_envs", num_envs)
     if unknown := sorted(set(scene_options) - set(OPTIONS)):
         # A TypeError in Python's words: clients such as GymEnv read it and try without.
         raise TypeError(

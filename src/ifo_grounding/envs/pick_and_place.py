@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs.simulator import Simulator
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.tasks.goals import MAX_STEPS, check_task, plan
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import STATE_LEAVES, Scene, SceneOptions, propose_goal
@@ -83,8 +83,7 @@ class PickAndPlaceEnv(EnvBase):
         max_steps: int = MAX_STEPS,
     ) -> None:
         check_choice("tile size", tile_size, TILE_SIZES)
-        if num_envs < 1:
-            raise UserError(f"num_envs must be at least 1, got {num_envs}")
+        num_envs = at_least_one("num_envs", num_envs)
         self.options = SceneOptions(
             task=task,
             instructed=instructed,

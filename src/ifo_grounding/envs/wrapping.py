@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from ifo_grounding import keys
 from ifo_grounding.envs.reading import ADD, ENDED, Read, Reading
 from ifo_grounding.envs.simulator import check_actions, scene_numbers
-from ifo_grounding.errors import UserError, check_choice, whole
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -154,8 +154,7 @@ class GymnasiumEnv(EnvBase):
         device: torch.device | str | None = None,
     ) -> None:
         check_choice("stream", stream, STREAMS)
-        if whole("num_envs", num_envs) < 1:
-            raise UserError(f"num_envs must be at least 1, got {num_envs}")
+        num_envs = at_least_one("num_envs", num_envs)
         if not callable(make):
             raise UserError(
                 "a world is an id or a function that makes it, such as its class, got "

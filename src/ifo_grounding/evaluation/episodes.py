@@ -169,9 +169,7 @@ def _remember(asked: TensorDictBase, env: EnvBase, state: TensorDictBase, active
 def most_steps(env_or_task: EnvBase | str, max_steps: int | None) -> int:
     """Return the most actions of an episode: as said, or those of a task or of an environment."""
     if max_steps is not None:
-        if max_steps < 1:
-            raise UserError(f"max_steps must be at least 1, got {max_steps}")
-        return max_steps
+        return at_least_one("max_steps", max_steps)
     return MAX_STEPS if isinstance(env_or_task, str) else MAX_STEPS_OF_OTHERS
 
 

@@ -271,12 +271,15 @@ def _purse(
 ) -> Callable[[Tensor, TensorDictBase], None]:
     """Return what adds each step's learned reward to ``total``."""
     step = 0
+    arrived = torch.zeros_like(total, dtype=torch.bool)
 
     def collect(rows: Tensor, transition: TensorDictBase) -> None:
         nonlocal step
         transition[pay.initial_pixels_key] = first[rows]
-        after = pay(transition)[keys.NEXT]
-        total[rows] += discount**step * after[pay.reward_key].reshape(-1)
+        reward, reached = (part.reshape(-1) for part in pay.pay(transition, transition[keys.NEXT]))
+        total[rows] += discount**step * reward.where(~arrived[rows], 0.0)
+        if pay.arrival is not None:  # where practice would end the episode
+            arrived[rows] |= reached
         step += 1
 
     return collect

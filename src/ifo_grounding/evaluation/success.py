@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.evaluation.episodes import (
     MODES,
     Outcomes,
@@ -106,8 +106,7 @@ def success_rate(
     0.0% [0.0, 7.1] (n=50) 1
     """
     check_choice("mode", mode, [*MODES, "both"])
-    if episodes < 1 or batch_size < 1:
-        raise UserError(f"episodes and batch_size must be positive, got {episodes}, {batch_size}")
+    episodes = at_least_one("episodes", episodes)
     options = {"seed": seed, "stream": stream, "batch_size": batch_size, **env_options}
     options["max_steps"] = limit = most_steps(env_or_task, max_steps)
     options["device"] = torch.device(device) if device is not None else device_of(policy)

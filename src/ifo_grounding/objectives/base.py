@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.networks.cells import hidden_from_python
 
 
 @contextlib.contextmanager
@@ -119,14 +120,15 @@ def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = 
     """Raise :class:`UserError` unless ``action`` has the shape that the network acts in.
 
     Where ``count`` actions are known, indices have to be of them; on a CPU, for elsewhere to look
-    is to wait.
+    is to wait, and not where ``torch.vmap`` or the compiler hides them.
     """
     if tuple(action.shape) != tuple(expected):
         raise UserError(
             f"actions must have shape {list(expected)}, got {list(action.shape)}: indices have no "
             "trailing dim, and one-hot actions fit a one-hot policy alone"
         )
-    if count is None or action.device.type != "cpu" or not action.numel():
+    seen = action.device.type == "cpu" and not hidden_from_python(action)
+    if count is None or not seen or not action.numel():
         return
     for number in map(int, action.aminmax()):
         if not 0 <= number < count:

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import at_least_one
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
@@ -77,8 +77,7 @@ class GoalLoss(SupervisedLoss):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
-        if negatives < 1:
-            raise UserError(f"negatives must be at least 1, got {negatives}")
+        negatives = at_least_one("negatives", negatives)
         self.count = negatives
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,6 +57,7 @@ class ImitationLoss(SupervisedLoss):
         """The labelled action, integer [*B]."""
 
     default_keys: Any = _AcceptedKeys
+    _selected: list[NestedKey] | None = None
 
     def __init__(
         self,
@@ -76,8 +78,16 @@ class ImitationLoss(SupervisedLoss):
     @property
     def out_keys(self) -> list[NestedKey]:
         """What is written, ``loss_words`` while a network learns that reads word by word."""
+        return self._all_out_keys() if self._selected is None else self._selected
+
+    @out_keys.setter
+    def out_keys(self, names: Sequence[NestedKey]) -> None:
+        """Write these alone (``select_out_keys``), or all again."""
+        self._selected = None if list(names) == self._all_out_keys() else list(names)
+
+    def _all_out_keys(self) -> list[NestedKey]:
         charged = self.training and charges(self.network)
-        words = ["loss_words"] if charged else []
+        words: list[NestedKey] = ["loss_words"] if charged else []
         return ["loss_imitation", *words, "accuracy", "entropy"]
 
     def set_progress(self, fraction: float) -> None:

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.modules import set_lenient
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import (
@@ -114,12 +114,10 @@ class InstructionLoss(SupervisedLoss):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
-        if negatives < 1:
-            raise UserError(f"negatives must be at least 1, got {negatives}")
+        negatives = at_least_one("negatives", negatives)
         if contrast < 0:
             raise UserError(f"contrast is a weight of at least 0, got {contrast}")
-        if fresh < 1:
-            raise UserError(f"fresh must be at least 1, got {fresh}")
+        fresh = at_least_one("fresh", fresh)
         if states is not None and (states.ndim != 4 or not len(states)):
             raise UserError(f"states must be images [S, C, H, W], got shape {list(states.shape)}")
         check_choice("treatment of unlabelled pairs", unlabelled, UNLABELLED)

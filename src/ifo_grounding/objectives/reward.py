@@ -80,7 +80,8 @@ class RewardLoss(SupervisedLoss):
         both = torch.stack([action, self._different(action)], -1)
         with self._mode():
             right, wrong = self._scores(tensordict, both).unbind(-1)
-        return self._losses(F.softplus(-right), F.softplus(wrong), right, wrong, tensordict)
+        halves = F.softplus(-right), F.softplus(wrong)
+        return self._losses(*halves, right, wrong, tensordict, tensordict)
 
     def adversarial(
         self, demonstrations: TensorDictBase, policy: TensorDictBase, smoothing: float = 0.1
@@ -113,7 +114,7 @@ class RewardLoss(SupervisedLoss):
         negative = F.binary_cross_entropy_with_logits(
             wrong, torch.full_like(wrong, smoothing), reduction="none"
         )
-        return self._losses(positive, negative, right, wrong)
+        return self._losses(positive, negative, right, wrong, demonstrations, policy)
 
     def _losses(
         self,
@@ -121,13 +122,15 @@ class RewardLoss(SupervisedLoss):
         negative: Tensor,
         right: Tensor,
         wrong: Tensor,
-        tensordict: TensorDictBase | None = None,
+        labelled: TensorDictBase,
+        others: TensorDictBase,
     ) -> TensorDict:
-        halves = [self._reduce_loss(half, tensordict) for half in (positive, negative)]
+        """Reduce both halves, each over the samples that the mask of its batch leaves."""
+        halves = self._reduce_loss(positive, labelled), self._reduce_loss(negative, others)
         return scalars(
             loss_reward=(halves[0] + halves[1]) / 2,
-            positive_probability=self._mean(right.sigmoid(), tensordict),
-            negative_probability=self._mean(wrong.sigmoid(), tensordict),
+            positive_probability=self._mean(right.sigmoid(), labelled),
+            negative_probability=self._mean(wrong.sigmoid(), others),
         )
 
     def _actions(self, tensordict: TensorDictBase) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.stats.rates import wilson
 from ifo_grounding.stats.results import Rate
 
@@ -34,8 +34,7 @@ def reliability(
     true = np.asarray(happened, dtype=bool).ravel()
     if len(said) != len(true):
         raise UserError(f"{len(said)} probabilities do not fit {len(true)} outcomes")
-    if bins < 1:
-        raise UserError(f"bins must be at least 1, got {bins}")
+    bins = at_least_one("bins", bins)
     if not ((said >= 0) & (said <= 1)).all():
         raise UserError("probabilities must lie in [0, 1]")
     places = np.minimum((said * bins).astype(int), bins - 1)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorClass
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, Generators, Shares, draw_rows, generator
 from ifo_grounding.tasks.goals import (
     MAX_STEPS,
@@ -78,8 +78,7 @@ class SceneOptions:
         check_choice("split", self.split, SPLITS)
         check_choice("stream", self.stream, STREAMS)
         holdout_kinds(self.holdout)
-        if self.max_steps < 1:
-            raise UserError(f"max_steps must be positive, got {self.max_steps}")
+        at_least_one("max_steps", self.max_steps)
 
     @property
     def shown_layout(self) -> Layout:

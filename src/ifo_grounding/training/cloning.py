@@ -47,6 +47,7 @@ def accepted_steps(
     for iteration in range(iterations):
         reseed(env, derive(seed, "accepted steps", iteration))
         batch = next(batches)
+        batch = batch.reshape(-1, batch.shape[-1])  # worlds may lie in workers
         mask = accepted(
             batch[keys.NEXT, keys.LEARNED_REWARD].squeeze(-1),
             batch[keys.NEXT, "done"].squeeze(-1),

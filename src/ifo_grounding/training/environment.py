@@ -6,15 +6,16 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
+from torchrl.envs.transforms import Transform
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import first_worker
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.supervised import Metrics
-from ifo_grounding.transforms._common import exposes_state, innermost, instructs
+from ifo_grounding.transforms._common import exposes_state, innermost, instructs, parts_of
 
 
 def check_env(env: EnvBase) -> None:
@@ -83,17 +84,11 @@ def sampler_stats(env: EnvBase) -> Metrics:
     return found
 
 
-def transforms_of(env: EnvBase) -> list[nn.Module]:
+def transforms_of(env: EnvBase) -> list[Transform]:
     """Return the transforms around an env, the innermost first; not those inside of workers."""
     if not isinstance(env, TransformedEnv):
         return []
-    return [*transforms_of(env.base_env), *_parts(env.transform)]
-
-
-def _parts(transform: nn.Module) -> list[nn.Module]:
-    if not isinstance(transform, Compose):
-        return [transform]
-    return [part for each in transform for part in _parts(each)]
+    return [*transforms_of(env.base_env), *parts_of(env.transform)]
 
 
 def summary(batch: TensorDictBase) -> Metrics:

@@ -12,7 +12,8 @@ from torchrl.data import ReplayBuffer
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import beside
-from ifo_grounding.training.supervised import total_loss
+from ifo_grounding.objectives import mode
+from ifo_grounding.training.supervised import generators_of, total_loss
 
 
 class HeldOut:
@@ -52,16 +53,19 @@ class HeldOut:
     @torch.no_grad()
     def look(self) -> float:
         """Measure the loss, and remember the weights if it is the lowest so far."""
-        training = self.loss.training
-        self.loss.eval()
-        with torch.random.fork_rng(devices=[]):
+        generators = generators_of(self.loss, self.buffer)
+        drawn = [generator.get_state() for generator in generators]
+        with mode(self.loss, training=False), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # the same negatives at every look
+            for generator in generators:
+                generator.manual_seed(0)
             total = 0.0
             for rows in torch.arange(len(self.buffer)).split(self.batch_size):
                 total += float(total_loss(self.loss(beside(self.buffer[rows], self.loss)))) * len(
                     rows
                 )
-        self.loss.train(training)
+        for generator, state in zip(generators, drawn, strict=True):
+            generator.set_state(state)
         mean = total / len(self.buffer)
         if mean < self.best_loss:
             self.best_loss = mean

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.files import atomic_write
 from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
 from ifo_grounding.seeding import generator
@@ -77,8 +77,7 @@ def select_pairs(
     >>> pairs["scene"].squeeze(-1).tolist()
     [0, 1, 2, 3, 4, 5]
     """
-    if n < 1:
-        raise UserError(f"the number of pairs must be at least 1, got {n}")
+    n = at_least_one("the number of pairs", n)
     if not isinstance(getattr(env, "scene_numbers", None), Tensor):
         raise UserError("select_pairs needs an environment with scene_numbers: PickAndPlaceEnv")
     if INSTRUCTION in env.full_observation_spec.keys(True, True):

@@ -44,7 +44,7 @@ class Learner:
         self.batches: Iterator[TensorDictBase] | None = None
         # Values are given: the estimator would look at nearly all states twice, as next ones too.
         self.advantage = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=None)
-        self.advantage.set_keys(reward=keys.LEARNED_REWARD)
+        self.advantage.set_keys(reward=keys.LEARNED_REWARD, value=value.out_keys[0])
         self.loss = _make_loss(policy, value, config)
         critic = {id(p) for p in value.parameters()}
         self.optimizer = make_optimizer(
@@ -145,7 +145,7 @@ def _make_loss(
         )
     else:
         loss = ReinforceLoss(policy, value)
-    loss.set_keys(reward=keys.LEARNED_REWARD)
+    loss.set_keys(reward=keys.LEARNED_REWARD, value=value.out_keys[0])
     return loss
 
 

@@ -28,7 +28,7 @@ from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.policy_gradient import Learner
 from ifo_grounding.training.rehearsal import Rehearsal
 from ifo_grounding.training.selection import Selection, SelectionSchedule
-from ifo_grounding.training.supervised import Callback, Log, Metrics
+from ifo_grounding.training.supervised import Callback, Log, Metrics, plain_numbers
 
 ALGORITHMS = ("ppo", "reinforce")
 NAME = "self-examination"
@@ -61,7 +61,7 @@ class SelfExaminationConfig:
     clip: float = 0.2
     """Clipping range of the probability ratio."""
     entropy: float = 0.01
-    """Weight of the entropy bonus."""
+    """Weight of the entropy bonus, with ``ppo``."""
     kl: float = 0.0
     """Reward that each nat away from the phase-1 policy costs."""
     value_warmup: int = 2
@@ -226,7 +226,7 @@ def self_examine(
                 selection.restore()
             due = config.evaluate_every and done % config.evaluate_every == 0
             if callback and (due or done == config.iterations):
-                metrics |= callback(done)
+                metrics |= plain_numbers(callback(done))
             history.append(metrics)
             if log:
                 log(metrics, done)

@@ -213,7 +213,7 @@ def fit(
             parts["sampler"] = sampler  # where it is in its round
         saved = Checkpoint(checkpoint, fingerprint(config, seed, name, settings), **parts)
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
-    generators = _generators(loss, buffer)
+    generators = generators_of(loss, buffer)
     for generator, drawn in zip(generators, state.get("generators", []), strict=False):
         generator.set_state(drawn)
     history: list[Metrics] = state["history"]
@@ -234,7 +234,7 @@ def fit(
                     held_out.restore()
             due = config.evaluate_every and done % config.evaluate_every == 0
             if callback and (due or done == iterations):
-                metrics |= callback(steps.stop)
+                metrics |= plain_numbers(callback(steps.stop))
             history.append(metrics)
             if log:
                 log(metrics, steps.stop)
@@ -248,7 +248,12 @@ def fit(
     return history
 
 
-def _generators(loss: nn.Module, buffer: Any) -> list[torch.Generator]:
+def plain_numbers(metrics: Metrics) -> Metrics:
+    """Return metrics as Python's numbers, which a checkpoint can hold."""
+    return {name: float(value) for name, value in metrics.items()}
+
+
+def generators_of(loss: nn.Module, buffer: Any) -> list[torch.Generator]:
     """Return the generators that a loss and a buffer draw from instead of the global one."""
     holders = [*loss.modules(), getattr(buffer, "sampler", None)]
     held = [getattr(one, name, None) for one in holders for name in ("generator", "_rng")]

@@ -8,12 +8,19 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.attributes import answers
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import ACTION_SCORE, GOAL_SCORE, SUITABILITY
+
+
+def parts_of(transform: Transform) -> list[Transform]:
+    """Return the transforms that a transform is composed of, however deep, in their order."""
+    if not isinstance(transform, Compose):
+        return [transform]
+    return [part for each in transform for part in parts_of(each)]
 
 
 class EpisodeTransform(Transform):

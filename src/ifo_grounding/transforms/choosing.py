@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.keys import PIXELS, SUITABILITY
 from ifo_grounding.modules import device_of, evaluating
 from ifo_grounding.transforms._common import flat_logit, logit_key
@@ -169,8 +169,7 @@ def check_options(threshold: float, candidates: int, choose: str) -> None:
     check_choice("choose", choose, CHOICES)
     if not 0 <= threshold < 1:
         raise UserError(f"threshold is a probability in [0, 1), got {threshold}")
-    if candidates < 1:
-        raise UserError(f"candidates must be at least 1, got {candidates}")
+    at_least_one("candidates", candidates)
 
 
 def draw_candidates(

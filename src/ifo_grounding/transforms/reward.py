@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Compose, EnvBase, Transform
+from torchrl.envs import EnvBase, Transform
 
 from ifo_grounding.attributes import stop_of
 from ifo_grounding.errors import UserError, check_choice
@@ -29,6 +29,7 @@ from ifo_grounding.transforms._common import (
     EpisodeTransform,
     flat_logit,
     logit_key,
+    parts_of,
 )
 
 FROM_ENV = "env"
@@ -176,7 +177,7 @@ class LearnedReward(EpisodeTransform):
         if self.judges_goals:
             first = tensordict.get(self.initial_pixels_key)
             next_tensordict.set(self.initial_pixels_key, first)
-        reward, arrived = self._pay(tensordict, next_tensordict)
+        reward, arrived = self.pay(tensordict, next_tensordict)
         if self.arrival is not None:
             for key in self.parent.done_keys:
                 if (key if isinstance(key, str) else key[-1]) != "truncated":
@@ -190,7 +191,7 @@ class LearnedReward(EpisodeTransform):
         A step is given what they have made of the last observation already.
         """
         beside = getattr(self.container, "transform", None)
-        parts = list(beside.transforms) if isinstance(beside, Compose) else []
+        parts = [] if beside is None else parts_of(beside)
         later = parts[parts.index(self) + 1 :] if self in parts else []
         written = {unravel_key(key) for part in later for key in part.out_keys or []}
         if not written.isdisjoint(self.in_keys):
@@ -204,16 +205,19 @@ class LearnedReward(EpisodeTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabel collected steps, a tensordict [*B], with ``("next", "learned_reward")``.
 
+        With ``arrival`` every step after which the goal looks reached is paid for it: only on an
+        environment does the episode end at the first.
+
         Raises:
             UserError: where an entry that a judge reads is missing.
         """
         if tensordict.get(NEXT, None) is None:
             tensordict.set(NEXT, tensordict.empty())
         after = tensordict.get(NEXT)
-        after.set(self.reward_key, self._pay(tensordict, after)[0])
+        after.set(self.reward_key, self.pay(tensordict, after)[0])
         return tensordict
 
-    def _pay(self, before: TensorDictBase, after: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def pay(self, before: TensorDictBase, after: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Reward of steps, float32 [*B, 1], and which of them are paid for their goal, [*B, 1]."""
         batch = before.batch_size
         rows = batch.numel()
@@ -292,6 +296,8 @@ class LearnedReward(EpisodeTransform):
     ) -> Tensor:
         """Logits [rows], on the device of the entries."""
         home = next(iter(entries.values())).device
+        if not rows:
+            return torch.zeros(0, device=home)
         device = device_of(judge) or home
         batch = TensorDict({}, batch_size=[rows])
         for key, value in entries.items():

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.keys import INSTRUCTION, PIXELS
 from ifo_grounding.seeding import generator
 from ifo_grounding.transforms._common import InstructionTransform
@@ -92,8 +92,7 @@ class InstructionSampler(InstructionTransform):
     ) -> None:
         super().__init__(in_keys=in_keys or [PIXELS], out_keys=out_keys or [INSTRUCTION])
         check_options(threshold, candidates, choose)
-        if max_tries < 1:
-            raise UserError(f"max_tries must be at least 1, got {max_tries}")
+        max_tries = at_least_one("max_tries", max_tries)
         self.threshold, self.candidates, self.choose = threshold, candidates, choose
         self._hopeful = False  # whether any state has ever been served
         self.max_tries, self.vocabulary_size = max_tries, vocabulary_size
@@ -232,5 +231,6 @@ class InstructionSampler(InstructionTransform):
                 f"{self.threshold} (best score {float(score[index < 0].max()):.2f}): select states "
                 "with choose_instructions first, or lower threshold"
             )
-        tensordict.set(self.out_keys[0], self.pool.to(pixels.device)[index].reshape(*batch, -1))
+        chosen = self.pool.to(pixels.device)[index]
+        tensordict.set(self.out_keys[0], chosen.reshape(*batch, chosen.shape[-1]))
         return tensordict

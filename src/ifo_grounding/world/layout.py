@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, whole
 from ifo_grounding.seeding import Generators, draw_rows
 from ifo_grounding.world.state import N_BOXES, N_KINDS, WorldState
 
@@ -29,13 +30,13 @@ class Layout:
 
     def __post_init__(self) -> None:
         """Refuse layouts that no grid can hold."""
-        if not 3 <= self.size <= 16:
+        if not 3 <= whole("size", self.size) <= 16:
             raise UserError(f"size must be 3..16 cells, got {self.size}")
         for name, counts, most in (
             ("objects", self.objects, self.size**2),
             ("boxes", self.boxes, N_BOXES),
         ):
-            if len(counts) != 2 or not 0 <= counts[0] <= counts[1] <= most:
+            if np.ndim(counts) != 1 or len(counts) != 2 or not 0 <= counts[0] <= counts[1] <= most:
                 raise UserError(f"{name} must be (fewest, most) within 0..{most}, got {counts}")
         if self.objects[1] + self.boxes[1] > self.size**2:
             raise UserError(
