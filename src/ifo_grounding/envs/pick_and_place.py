@@ -32,7 +32,8 @@ class PickAndPlaceEnv(EnvBase):
 
     An episode ends when the policy stops (terminated) or after ``max_steps`` actions (truncated);
     the reward is 1 if its instruction is then fulfilled, else 0 (paper, "Environment for Proposed
-    Task").
+    Task"). A world that has ended goes on where it is not reset, and may be paid again: a transform
+    that steps several times at once, such as TorchRL's ``FrameSkipTransform``, does not fit it.
 
     Args:
         task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.

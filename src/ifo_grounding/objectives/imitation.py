@@ -29,6 +29,8 @@ class ImitationLoss(SupervisedLoss):
     Of a network with :class:`~ifo_grounding.networks.WordMaps`, which reads word by word, it also
     writes ``loss_words``: what its words say about colours and about form is charged for, the more
     the better the actions are predicted. A word that needs but one of the two then keeps to it.
+    Train such a network eagerly: inside ``torch.compile`` it does not tell words apart that occur
+    from those that do not, and nothing is charged.
 
     Args:
         network: a policy with ``get_dist``, as ``make_policy`` builds it.

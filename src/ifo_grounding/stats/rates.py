@@ -134,7 +134,8 @@ def paired_difference(
     alike, which a bootstrap tells little from, it also covers the exact ones (Clopper and Pearson)
     of how many became better and of how many worse. With one seed ([scenes]) the p-value is
     McNemar's exact test, and speaks of this pair of policies; with several ([seeds, scenes]) it is
-    a t test over seeds, whose variance also counts what the scenes that they share have in common.
+    a t test over seeds, whose variance also counts what the scenes that they share have in common
+    and, where all seeds changed as much, what their scenes leave unexplained.
     Two seeds hardly ever pass it, however narrow the interval. With several seeds the interval is
     rather too wide where they hardly differ, and too narrow where they differ by much.
 
