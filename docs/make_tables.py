@@ -52,7 +52,7 @@ KEPT = "phase 1 kept"
 EARLIER = "†"
 EARLIER_NOTE = (
     f"{EARLIER} made with other options than `reproduce` says today; its file names them. What"
-    " presets say may have changed since, too: `reproduce table=2 list=true` says it of each piece."
+    " presets say may have changed since, too: `reproduce` with `list=true` says it of each piece."
 )
 OPTIONS_OF: dict[str, Any] = OmegaConf.to_container(  # type: ignore[assignment]
     OmegaConf.load(ROOT / "recipes" / "conf" / "reproduce.yaml").options_of
@@ -232,7 +232,7 @@ def content() -> str:
         "## Table 3: suitable instructions",
         "Of the instructions chosen for 20,000 fresh states, the share that is suitable, and the"
         " share of states that got one. `at most` is the share of states that any instruction of"
-        " the demonstrations suits, by the oracle.",
+        " the demonstrations suits, by the oracle, of the first 500 of these states alone.",
         noted(table(suitability_rows(found))),
         "## Table 4: zero-shot",
         "Instructions that mention at least one of three colour-shape pairs which no instruction of"

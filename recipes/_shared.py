@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -82,6 +83,8 @@ def open_run(options: DictConfig) -> Run:
         torch.set_num_threads(options.threads)
     run = Run(options.run, options.logger)
     if options.base:
+        if not run.begun:
+            (run / MADE).unlink(missing_ok=True)  # of a call that was refused
         run.take_over(Run(options.base), without=PHASE_2)
     return run
 
@@ -241,9 +244,11 @@ def tell(result: dict[str, Any]) -> None:
 def _written(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(_written, value))
-    if isinstance(value, float) and not value.is_integer() and abs(value) < 1000:
+    if not isinstance(value, float) or not math.isfinite(value):
+        return format_cell(value)
+    if not value.is_integer() and abs(value) < 1000:
         return f"{value:.4g}"
-    return format_cell(round(value) if isinstance(value, float) else value)
+    return format_cell(round(value))
 
 
 def plain(node: Any) -> Any:

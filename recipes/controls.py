@@ -1,11 +1,13 @@
 """What phase 2 has to beat: its compute spent on imitation, and cloning what the judge accepts."""
 
 import math
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from _learning import self_examination_config, train
+from _options import as_made
 from _shared import CONTROLS, POLICIES, load_network, open_stage, tell
 from imitate import labelled_demonstrations
 from omegaconf import DictConfig, OmegaConf
@@ -16,7 +18,14 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.training import FitConfig, Rehearsal, Selection, Stage, accepted_steps
+from ifo_grounding.training import (
+    FitConfig,
+    NothingAcceptedError,
+    Rehearsal,
+    Selection,
+    Stage,
+    accepted_steps,
+)
 
 SECTIONS = ["imitate", "self_examine", "instruction", "controls"]
 
@@ -128,13 +137,16 @@ def run_controls(options: DictConfig) -> list[dict]:
     """Make both controls, or without ``controls.clone`` the first."""
     results = [continue_imitation(options)]
     if options.controls.clone:
-        results.append(clone_accepted(options))
+        try:
+            results.append(clone_accepted(options))
+        except NothingAcceptedError as error:
+            print(f"note: nothing is cloned, for {error}", file=sys.stderr)
     return results
 
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    for result in run_controls(options):
+    for result in run_controls(as_made(options)):
         tell(result)
 
 

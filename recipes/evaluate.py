@@ -68,9 +68,10 @@ def evaluate(options: DictConfig) -> dict:
     there = [name for name, file in NAMES.items() if (run / file).exists()]
     current = [name for name in there if run.is_current(STAGES[name])]
     for name in sorted({*there} - {*current}):
+        recipe = "controls" if NAMES[name] in CONTROLS else STAGES[name]
         print(
             f"note: {name} builds on what was made anew since, and is left out: run the recipe "
-            f"{STAGES[name]} again",
+            f"{recipe} again",
             file=sys.stderr,
         )
     policies = {name: load_network(run, NAMES[name], "imitate", options) for name in current}

@@ -32,8 +32,8 @@ def label(options: DictConfig) -> dict:
     report.save(stage.run / LABELS)
     found: dict[str, Any] = {"confidence": report.summary()}
     # Only the evaluation reads the truth: nothing of it goes back into training.
-    if not options.recorded:
-        truth = Truth.load(stage.run.need(TRUTH, "record_demonstrations"))
+    if (stage.run / TRUTH).exists():  # recorded demonstrations have none
+        truth = Truth.load(stage.run / TRUTH)
         accuracy = label_accuracy(report.actions, truth, names=open_world(options).actions)
         found["accuracy"] = accuracy.as_dict()
     return stage.finish(found)

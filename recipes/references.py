@@ -3,6 +3,7 @@
 No learner of observation-only demonstrations may read these actions: a reference, not a method.
 """
 
+from _options import as_made
 from _shared import REFERENCE, TRUTH, load_demonstrations, load_network, open_stage
 from _worlds import open_world
 from evaluate import measured_success, success_results
@@ -11,6 +12,7 @@ from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import Truth
+from ifo_grounding.errors import UserError
 from ifo_grounding.report import results_table
 from ifo_grounding.report.results import by_scene
 
@@ -34,14 +36,19 @@ def imitate_truth(options: DictConfig) -> dict:
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
-    truth = Truth.load(stage.run.need(TRUTH, "record_demonstrations"))
+    if not (stage.run / TRUTH).exists():
+        raise UserError(
+            f"{stage.run / TRUTH} is missing: demonstrations that were recorded elsewhere hold no "
+            "actions, and have no references"
+        )
+    truth = Truth.load(stage.run / TRUTH)
     seen, held_out = split_transitions(demos, truth.actions, options.imitate.held_out)
     return imitate_transitions(options, stage, seen, held_out, REFERENCE)
 
 
 @recipe_main
 def main(options: DictConfig) -> None:
-    print(results_table(references(options)))
+    print(results_table(references(as_made(options))))
 
 
 if __name__ == "__main__":

@@ -71,6 +71,12 @@ class Piece:
         """The options that its call has today."""
         return today(self.arguments)
 
+    def otherwise(self) -> list[str]:
+        """Return what the call of its file said otherwise than today's: it is made anew."""
+        if not self.file.exists():
+            return []
+        return sorted({*read_json(self.file)["command"].split()[3:]} - {*self.arguments})
+
     def changed(self) -> list[str]:
         """Return what today's presets and budgets say otherwise than the options of its file.
 
@@ -252,8 +258,9 @@ def reproduce(options: DictConfig) -> list[Piece]:
     chains = pieces(options)
     if options.list:
         for piece in (piece for chain in chains for piece in chain):
-            print("done   " if piece.done else "not run", piece.file)
-            if piece.done and (changed := piece.changed()):
+            there = "other  " if piece.file.exists() else "not run"
+            print("done   " if piece.done else there, piece.file)
+            if changed := piece.changed() if piece.done else piece.otherwise():
                 print("        made with", ", ".join(changed))
         return []
     failed: list[Piece] = []

@@ -132,6 +132,8 @@ def compare(options: DictConfig) -> dict[str, dict]:
     """Imitate the same demonstrations with each variant, and measure what it does and sees."""
     for name in options.variants:
         check_choice("variant", name, VARIANTS)
+    if options.simulator != "grid":
+        raise UserError("held-out pairs are of the grid: leave world=babyai out")
     if options.network != "strong":
         raise UserError(f"variants are of preset strong: leave preset={options.network} out")
     for prepare in (collect, train_inverse, record, label):

@@ -122,6 +122,7 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
         (["task=fly"], "unknown task 'fly': choose move or pick"),
         (["task=missing"], "option 'folder' is required: give it a value"),
         (["-m", "preset=paper,huge"], "unknown preset 'huge': choose one of paper, strong"),
+        (["steps=1,2", "--multirun", "task=pick"], "'task=pick' stands after a flag: put"),
         (["-m", "steps=1,many"], "option 'steps' takes a whole number, not 'many'"),
         (["-m", "steps=range(0, 1, 0.5)"], "option 'steps' takes a whole number, not 0.0"),
         (["-m", "sizes=[3],4"], "option 'sizes' takes a list, not 4"),
@@ -289,3 +290,14 @@ def test_the_wheel_works_outside_of_the_repository(wheel, tmp_path):
     listed = {path.name for path in (package / "recipes").rglob("*") if path.is_file()}
     source = {p.name for p in recipes_folder().rglob("*") if p.suffix in (".py", ".yaml")}
     assert listed == source
+
+
+def test_jobs_of_a_sweep_do_not_overwrite_each_other(recipes, capsys):
+    with (recipes / "conf" / "greet.yaml").open("a") as options:
+        options.write("run: ${task}-${width}\n")
+    assert run("run", "greet", "--multirun", "steps=1,2") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: several jobs of this sweep are the run 'move-64': name them")
+    assert run("run", "greet", "--multirun", "steps=1,2", "run='${task}-${steps}'") == 0
+    assert run("run", "greet", "--multirun", "preset=paper,strong", "task=move,pick") == 0
+    assert capsys.readouterr().out.count("hello") == 6

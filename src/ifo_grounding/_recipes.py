@@ -6,6 +6,7 @@ import contextlib
 import functools
 import inspect
 import io
+import itertools
 import os
 import sys
 from argparse import Namespace
@@ -153,6 +154,8 @@ def _parse_flags(arguments: Sequence[str]) -> Namespace:
             raise
         raise UserError(said.getvalue().rpartition("error: ")[2]) from None
     unknown = [text for text in unknown if text.startswith("-")] or unknown
+    if unknown and "=" in unknown[0] and not unknown[0].startswith("-"):
+        raise UserError(f"{unknown[0]!r} stands after a flag: put flags before all options")
     if unknown:
         raise UserError(f"unknown flag {unknown[0]!r}: options are written name=value; see --help")
     return flags
@@ -195,6 +198,43 @@ def _check_overrides(name: str, texts: Sequence[str], several: bool) -> None:
         compose(name, overrides=[*chosen, *whole])
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(str(error)) from None
+    if several and "run" in defaults:
+        _check_apart(name, [*groups, *values])
+
+
+def _check_apart(name: str, overrides: Sequence[Override]) -> None:
+    """Refuse a sweep of which one run would overwrite another."""
+    from hydra import compose
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf.errors import OmegaConfBaseException
+
+    if any(each.is_sweep_override() and not each.is_discrete_sweep() for each in overrides):
+        return  # how many there will be is not known here
+    options = [
+        [f"{each.get_key_element()}={text}" for text in each.sweep_string_iterator()]
+        if each.is_sweep_override()
+        else [each.input_line or ""]
+        for each in overrides
+    ]
+    runs: dict[str, tuple[str, ...]] = {}
+    for job in itertools.product(*options):
+        composed = compose(name, overrides=list(job), return_hydra_config=True)
+        known = HydraConfig.instance()
+        known.set_config(composed)
+        try:
+            run = str(composed.run)
+        except OmegaConfBaseException:
+            return  # its name is composed of what only a run knows
+        finally:
+            known.cfg = None
+        if run in runs:
+            apart = set(job) ^ set(runs[run])
+            key = next(text.partition("=")[0] for text in job if text in apart)
+            raise UserError(
+                f"several jobs of this sweep are the run {run!r}: name them apart, such as "
+                f"run='NAME-${{{key}}}-seed${{seed}}'"
+            )
+        runs[run] = job
 
 
 def _check_group(name: str, override: Override) -> None:

@@ -14,6 +14,7 @@ def demos():
 @pytest.mark.parametrize("pictures", [False, True])
 def test_both_phases_learn_from_recorded_demonstrations(compose, tmp_path, demos, pictures, capsys):
     from label import label
+    from references import imitate_truth
     from two_phase import two_phase
 
     from report import report
@@ -35,6 +36,9 @@ def test_both_phases_learn_from_recorded_demonstrations(compose, tmp_path, demos
     two_phase(compose("two_phase", *given))
     assert "running" not in capsys.readouterr().out
     assert "accuracy" not in label(compose("label", *given))
+    with pytest.raises(UserError, match="hold no actions"):
+        imitate_truth(options)
+    assert (tmp_path / "run" / "stages" / "record_demonstrations.json").exists()
 
 
 def test_what_was_recorded_before_goes_with_its_truth(compose, tmp_path, demos):

@@ -124,6 +124,7 @@ def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
     assert "continued" in alone and "cloned" not in alone
     results = study(options)
     names = ("phase1", "phase2", "continued", "cloned")
+    assert "accepted rollouts cloned, success (control)" in results_table(results)
     assert len({results[name]["scenes"] for name in names}) == 1
     assert all(len(bytes.fromhex(results[name]["outcomes"])) == 7 for name in names)  # 50 scenes
     section = options.self_examine
@@ -437,7 +438,21 @@ def test_impossible_options_are_refused_before_a_run_begins(compose, tmp_path, w
 def test_a_stage_says_what_it_found_line_by_line(compose, capsys):
     from _shared import tell
 
-    tell({"taken": [1200, 3.0], "grad_norm": 0.87186746, "samples_per_second": 11786.6, "to": "x"})
+    found = {"grad_norm": 0.87186746, "samples_per_second": 11786.6, "to": "x", "auc": math.nan}
+    tell({"taken": [1200, 3.0], **found})
     _, _, *lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[-1] for line in lines] == ["3", "0.8719", "11,787", "x"]
+    assert [line.split()[-1] for line in lines] == ["3", "0.8719", "11,787", "x", "–"]
     assert lines[0].split() == ["taken", "1,200,", "3"]
+
+
+def test_a_call_that_was_refused_does_not_keep_a_run_from_its_base(compose, tmp_path):
+    from _shared import open_run
+    from label import label
+    from record_demonstrations import record
+
+    record(compose("record_demonstrations", f"run={tmp_path / 'first'}"))
+    with pytest.raises(UserError, match="is missing"):
+        label(compose("label"))
+    assert (tmp_path / "run" / "options.json").exists()
+    run = open_run(compose("label", f"base={tmp_path / 'first'}"))
+    assert run.record("record_demonstrations")

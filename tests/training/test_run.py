@@ -109,6 +109,13 @@ def test_a_run_takes_over_what_another_has_finished(tmp_path):
     assert second.stage("count", {"to": 4}).result == {"counted": 4}
     with pytest.raises(UserError, match="no finished stages"):
         Run(tmp_path / "third").take_over(Run(tmp_path / "nowhere"))
+    (tmp_path / "empty").mkdir()
+    Run(tmp_path / "empty").take_over(first)
+    assert Run(tmp_path / "empty").begun
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").touch()
+    with pytest.raises(UserError, match="holds other files"):
+        Run(tmp_path / "other").take_over(first)
 
 
 def test_a_stage_counts_the_time_before_a_kill(tmp_path, monkeypatch):

@@ -16,6 +16,8 @@ from ifo_grounding.stats import Difference, Estimate, Rate, wilson
 
 REFERENCES = {"true_actions": "imitation of true actions", "demonstrator": "demonstrator"}
 """What no learner can or may be, by its name in the results."""
+CONTROLS = {"continued": "imitation continued", "cloned": "accepted rollouts cloned"}
+"""What phase 2 has to beat, by its name in the results."""
 Measured = TypeVar("Measured", Rate, Estimate, Difference)
 Key = TypeVar("Key", bound=Hashable)
 
@@ -49,6 +51,9 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
             add(f"phase {phase} success, {success['mode']}", restored(Rate, success["rate"]))
             if sampled := success.get("sampled"):
                 add(f"phase {phase} success, sampled", restored(Rate, sampled["rate"]))
+    for name, title in CONTROLS.items():
+        if success := results.get(name):
+            add(f"{title}, success (control)", restored(Rate, success["rate"]))
     if gain := results.get("gain"):
         add("phase 2 - phase 1, paired, points", restored(Difference, gain))
     for name, title in REFERENCES.items():

@@ -2,7 +2,7 @@
 
 from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
-from ifo_grounding.training.cloning import accepted, accepted_steps
+from ifo_grounding.training.cloning import NothingAcceptedError, accepted, accepted_steps
 from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.held_out import HeldOut
 from ifo_grounding.training.pairs import load_pairs, save_pairs, select_pairs
@@ -18,6 +18,7 @@ __all__ = [
     "FitConfig",
     "Guard",
     "HeldOut",
+    "NothingAcceptedError",
     "Rehearsal",
     "Run",
     "Selection",

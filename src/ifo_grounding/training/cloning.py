@@ -13,6 +13,10 @@ from ifo_grounding.seeding import derive
 from ifo_grounding.training.environment import check_env, make_collector, reseed
 
 
+class NothingAcceptedError(UserError):
+    """The judge accepted no episode of the policy's."""
+
+
 @torch.no_grad()
 def accepted_steps(
     env: EnvBase,
@@ -38,7 +42,7 @@ def accepted_steps(
         ``pixels``, ``instruction`` and ``action`` of the accepted episodes' steps, [N].
 
     Raises:
-        UserError: where no episode was accepted.
+        NothingAcceptedError: where no episode was accepted.
     """
     check_env(env)
     policy.eval()
@@ -60,7 +64,7 @@ def accepted_steps(
     if not len(chosen):
         lower = "lower the threshold (controls.accept), train policy and judge for longer"
         longer = f"none ended within {steps} steps: play for longer (self_examine.steps)"
-        raise UserError(
+        raise NothingAcceptedError(
             f"the judge accepted no episode of {iterations} rounds in {env.batch_size.numel()} "
             f"environments, at a learned return of {threshold:g} or more: "
             f"{lower if ended else longer}, or do without cloning (controls.clone=false)"

@@ -74,6 +74,12 @@ class Run:
             raise UserError(f"{path} is missing: run the recipe {recipe} with the same run first")
         return path
 
+    @property
+    def begun(self) -> bool:
+        """Whether any stage of it was done, or has left a checkpoint."""
+        left = (self.folder / name for name in ("stages", "checkpoints"))
+        return any(folder.is_dir() and any(folder.iterdir()) for folder in left)
+
     def take_over(self, other: Run, without: Sequence[str] = ()) -> None:
         """Copy what another run has made, unless this one has begun.
 
@@ -85,10 +91,13 @@ class Run:
             without: names of stages and files that this run is to make anew.
 
         Raises:
-            UserError: where the other run does not exist.
+            UserError: where the other run does not exist, or this one's folder holds what is no
+                run's.
         """
-        if self.folder.exists():
+        if self.begun:
             return
+        if self.folder.is_dir() and any(self.folder.iterdir()):
+            raise UserError(f"{self.folder} holds other files and no run: name another run")
         if not (other.folder / "stages").is_dir():
             raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
         anew = [*without, *(f"{name}.json" for name in without)]
