@@ -88,8 +88,9 @@ def test_a_preset_may_have_options_of_one_task_alone(options):
     from reproduce import pieces
 
     for task, expected in {
-        "pick": ["networks.sentence_rate=0.03"],
-        "pick-out": ["networks.sentence_rate=0.1", "networks.sentence_pooling=last"],
+        "move": ["networks.sentence_rate=0.03"],
+        "pick-out": ["networks.sentence_rate=0.03", "networks.sentence_pooling=last"],
+        "pick-udlr": ["networks.sentence_rate=0.1"],
     }.items():
         (chain,) = pieces(options("figure=6", f"tasks=[{task}]", "presets=[paper]"))
         for piece in chain:
