@@ -208,8 +208,11 @@ def _check_apart(name: str, overrides: Sequence[Override]) -> None:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf.errors import OmegaConfBaseException
 
-    if any(each.is_sweep_override() and not each.is_discrete_sweep() for each in overrides):
+    swept = [each for each in overrides if each.is_sweep_override()]
+    if not all(each.is_discrete_sweep() for each in swept):
         return  # how many there will be is not known here
+    if all(each.key_or_group.startswith("evaluate.") for each in swept):
+        return  # looks at one run
     options = [
         [f"{each.get_key_element()}={text}" for text in each.sweep_string_iterator()]
         if each.is_sweep_override()
@@ -229,7 +232,7 @@ def _check_apart(name: str, overrides: Sequence[Override]) -> None:
             known.cfg = None
         if run in runs:
             apart = set(job) ^ set(runs[run])
-            key = next(text.partition("=")[0] for text in job if text in apart)
+            key = next((text.partition("=")[0] for text in job if text in apart), "seed")
             raise UserError(
                 f"several jobs of this sweep are the run {run!r}: name them apart, such as "
                 f"run='NAME-${{{key}}}-seed${{seed}}'"
