@@ -101,3 +101,8 @@ def set_lenient(module: nn.Module, lenient: bool) -> None:
     for part in module.modules():
         if hasattr(part, "lenient"):
             part.lenient = lenient  # type: ignore[assignment]
+
+
+def hidden_from_python(tensor: Tensor) -> bool:
+    """Whether ``torch.vmap`` or the compiler works on ``tensor``: no shape may depend on it."""
+    return torch._C._functorch.is_batchedtensor(tensor) or torch.compiler.is_compiling()

@@ -179,8 +179,3 @@ def look_up(table: Tensor, index: Tensor) -> Tensor:
     if table.device.type != "cpu":
         return F.embedding(index, table)
     return table.index_select(0, index.flatten()).unflatten(0, index.shape)
-
-
-def hidden_from_python(tensor: Tensor) -> bool:
-    """Whether ``torch.vmap`` or the compiler works on ``tensor``: no shape may depend on it."""
-    return torch._C._functorch.is_batchedtensor(tensor) or torch.compiler.is_compiling()

@@ -16,7 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.networks.cells import hidden_from_python, look_up
+from ifo_grounding.modules import hidden_from_python
+from ifo_grounding.networks.cells import look_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import PatchEncoder
 from ifo_grounding.networks.fusion import cell_places

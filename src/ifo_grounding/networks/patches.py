@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
 from ifo_grounding.mosaic import as_words
-from ifo_grounding.networks.cells import hidden_from_python
 
 FEWEST_WINDOWS = 1 << 12
 """Fewer windows than that are computed as fast as they are compared."""

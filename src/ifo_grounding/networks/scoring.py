@@ -11,12 +11,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.networks.cells import (
     Cells,
     Groups,
     Kinds,
     group_cells,
-    hidden_from_python,
     look_up,
     pair_up,
 )

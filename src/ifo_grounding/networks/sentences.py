@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.networks.cells import hidden_from_python, look_up
+from ifo_grounding.modules import hidden_from_python
+from ifo_grounding.networks.cells import look_up
 from ifo_grounding.networks.config import POOLINGS
 
 

@@ -12,7 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks.cells import Cells, Pairs, hidden_from_python, look_up, pair_up
+from ifo_grounding.modules import hidden_from_python
+from ifo_grounding.networks.cells import Cells, Pairs, look_up, pair_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder, begin_before_relu
 from ifo_grounding.networks.fusion import (

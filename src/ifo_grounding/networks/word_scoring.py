@@ -10,7 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.networks.cells import Cells, Kinds, group_cells, hidden_from_python, look_up
+from ifo_grounding.modules import hidden_from_python
+from ifo_grounding.networks.cells import Cells, Kinds, group_cells, look_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.fusion import cell_places
 from ifo_grounding.networks.grounding import (

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.networks.cells import hidden_from_python
+from ifo_grounding.modules import hidden_from_python
 
 
 @contextlib.contextmanager
