@@ -297,12 +297,11 @@ class Demonstrations:
 
     def first_frames(self, index: Tensor | slice = slice(None)) -> Tensor:
         """Return the first frames of some episodes, uint8 [*B, C, H, W]."""
-        return self.frames(self._starts[index if isinstance(index, slice) else index.cpu()])
+        return self.frames(self._starts[_on_cpu(index)])
 
     def last_frames(self, index: Tensor | slice = slice(None)) -> Tensor:
         """Return the last frames of some episodes, uint8 [*B, C, H, W]."""
-        last = self._starts + self._lengths - 1
-        return self.frames(last[index if isinstance(index, slice) else index.cpu()])
+        return self.frames((self._starts + self._lengths - 1)[_on_cpu(index)])
 
     def locate(self, transition: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the episode and the number of the first frame of transitions, int64 [*B] each.
@@ -412,3 +411,8 @@ def _padded(instructions: Tensor, vocabulary: Vocabulary) -> Tensor:
             f"{vocabulary.length}: make it with length={instructions.shape[-1]}"
         )
     return F.pad(instructions, (0, missing)) if missing else instructions
+
+
+def _on_cpu(index: Any) -> Any:
+    """Return an index of what lies in main memory, whatever kind it is of."""
+    return index.cpu() if isinstance(index, Tensor) else index

@@ -11,7 +11,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torchrl.envs import EnvBase
 
 from ifo_grounding.allocation import release_freed_memory
-from ifo_grounding.errors import UserError, check_choice, check_numbers
+from ifo_grounding.errors import UserError, at_least_one, check_choice, check_numbers
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.adversary import Adversary
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
@@ -92,8 +92,7 @@ class SelfExaminationConfig:
             raise UserError("lr and value_lr must be finite")
         counts = ("iterations", "steps", "epochs", "minibatch", "select_episodes", "max_steps")
         for name in (*counts, "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+            at_least_one(name, getattr(self, name))
         for name in ("lr", "value_lr", "clip", "grad_clip"):
             if getattr(self, name) <= 0:
                 raise UserError(f"{name} must be above 0, got {getattr(self, name)}")

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import RandomSampler, ReplayBuffer
 
-from ifo_grounding.errors import UserError, check_numbers
+from ifo_grounding.errors import UserError, at_least_one, check_numbers
 from ifo_grounding.modules import beside, device_of
 from ifo_grounding.networks.transfer import inherited
 from ifo_grounding.seeding import derive
@@ -74,8 +74,7 @@ class FitConfig:
         """Refuse sizes that cannot be."""
         check_numbers(self)
         for name in ("steps", "batch_size", "iteration", "validate_every"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+            at_least_one(name, getattr(self, name))
         for name in ("lr", "grad_clip"):
             if not getattr(self, name) > 0:
                 raise UserError(f"{name} must be above 0, got {getattr(self, name)}")
