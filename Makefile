@@ -1,13 +1,14 @@
 # Two commands set everything up: `make demo` runs the main job, `make test` runs the tests.
 PYTHON ?= $(shell python3.11 -c 'import venv' 2>/dev/null && echo python3.11 || echo python3)
 WORKERS ?= 2
+DEVICE ?= cpu
 BIN := .venv/bin
 RUN := .venv/.installed
 DEV := .venv/.installed-dev
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test test-slow test-browser bench lint types docs format wheel clean
+.PHONY: help demo test test-slow test-browser test-gpu bench lint types docs format wheel clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -25,6 +26,10 @@ test-browser: $(DEV) ## tests that open pages in headless Chromium: the system's
 	command -v chromium chromium-browser >/dev/null || $(BIN)/playwright install chromium
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m browser tests/browser $(ARGS)
 
+test-gpu: $(DEV) ## tests that need a GPU, and those that pretend one where there is none
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m gpu $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest tests/test_devices.py tests/recipes/test_two_phase.py -k gpu $(ARGS)
+
 bench: $(DEV) ## speed of every part beside peers, in under ten minutes (ARGS="pixels step")
 	for peer in navix minigrid imitation; do \
 	  test -e .venv-peers/$$peer/.installed || { \
@@ -32,7 +37,7 @@ bench: $(DEV) ## speed of every part beside peers, in under ten minutes (ARGS="p
 	    .venv-peers/$$peer/bin/pip install --quiet -r benchmarks/peers/$$peer.txt && \
 	    touch .venv-peers/$$peer/.installed; } || echo "$$peer cannot be installed here"; \
 	done
-	$(BIN)/python benchmarks/run.py --out results/bench/cpu.json $(ARGS)
+	$(BIN)/python benchmarks/run.py --device $(DEVICE) --out results/bench/$(DEVICE).json $(ARGS)
 
 lint: $(DEV) ## style
 	$(BIN)/ruff check

@@ -7,12 +7,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from _shared import plain, shows_progress
 from omegaconf import DictConfig
 from torch import nn
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding import networks
+from ifo_grounding.data import FrameDecoder
 from ifo_grounding.objectives import SupervisedLoss
 from ifo_grounding.seeding import derive
 from ifo_grounding.training import FitConfig, HeldOut, SelfExaminationConfig, fit
@@ -59,6 +61,7 @@ def learn(
     **kwargs: Any,
 ) -> list[Metrics]:
     """Learn on from a checkpoint as a section of the options says."""
+    decode_on(options.device, buffer)
     return fit(
         loss,
         buffer,
@@ -69,8 +72,16 @@ def learn(
         checkpoint_seconds=options.checkpoint_seconds,
         progress=shows_progress(options),
         settings=stage.settings,
+        cudagraph=True,
         **kwargs,
     )
+
+
+def decode_on(device: str, buffer: ReplayBuffer) -> None:
+    """Let a buffer keep its frames on a GPU and decode them there, unless they are pixels."""
+    parts = [part for part in buffer.transform.modules() if isinstance(part, FrameDecoder)]
+    if torch.device(device).type == "cuda" and all(part.words is not None for part in parts):
+        buffer.transform.to(device)
 
 
 def beginning_seed(options: DictConfig, number: int) -> int:

@@ -8,13 +8,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from _changes import changes, flat, today
-from _shared import plain, result_file
+from _shared import RUNNING, plain, result_file
 from omegaconf import DictConfig
 from tqdm import tqdm
 
@@ -59,8 +59,7 @@ class Piece:
         if not self.file.exists():
             return False
         made = read_json(self.file)
-        _, _, _, *arguments = made["command"].split()  # ifo-grounding run study
-        said = {each.partition("=")[0] for each in {*arguments} ^ {*self.arguments}}
+        said = {each.partition("=")[0] for each in saying(made) ^ {*self.arguments}} - {*RUNNING}
         then, now = (flat(each) if said else {} for each in (made["options"], self.today))
         return said <= now.keys() and all(
             then[name] == now[name] if name in then else not now[name] for name in said
@@ -75,7 +74,8 @@ class Piece:
         """Return what the call of its file said otherwise than today's: it is made anew."""
         if not self.file.exists():
             return []
-        return sorted({*read_json(self.file)["command"].split()[3:]} - {*self.arguments})
+        other = saying(read_json(self.file)) - {*self.arguments}
+        return sorted(each for each in other if each.partition("=")[0] not in RUNNING)
 
     def changed(self) -> list[str]:
         """Return what today's presets and budgets say otherwise than the options of its file.
@@ -106,6 +106,11 @@ class Piece:
         return home() / "runs" / self.run
 
 
+def saying(made: dict[str, Any]) -> set[str]:
+    """Return the arguments of the call of ``ifo-grounding run study`` that a file is of."""
+    return {*made["command"].split()[3:]}
+
+
 def pieces(options: DictConfig) -> list[list[Piece]]:
     """Return the pieces of what is asked for: chains, each from one phase 1."""
     asked = {kind for kind in ("table", "figure", "ablation", "level") if options[kind] is not None}
@@ -119,7 +124,11 @@ def pieces(options: DictConfig) -> list[list[Piece]]:
         raise UserError(f"jobs must be at least 1, got {options.jobs}")
     found = table_chains(options) if asked & {"table", "figure"} else []
     found += ablation_chains(options) if "ablation" in asked else []
-    return found + (level_chains(options) if "level" in asked else [])
+    found += level_chains(options) if "level" in asked else []
+    if options.device == "cpu":
+        return found
+    there = (f"device={options.device}",)
+    return [[replace(piece, arguments=piece.arguments + there) for piece in of] for of in found]
 
 
 def table_chains(options: DictConfig) -> list[list[Piece]]:

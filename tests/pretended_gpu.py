@@ -1,7 +1,7 @@
 """A GPU where there is none: tensors in main memory that say ``cuda:0`` and refuse to meet others.
 
 What runs here has the devices of its tensors right, and takes the paths that a GPU takes. Nothing
-is said of CUDA's own kernels, of its random numbers or of its speed.
+is said of CUDA's own kernels and graphs, of its random numbers or of its speed.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map_only
+
+from ifo_grounding.training import supervised
 
 GPU = torch.device("cuda", 0)
 PLACED = "pretended"
@@ -43,9 +45,14 @@ class Generator(torch.Generator):
 
 @contextlib.contextmanager
 def pretended_gpu() -> Iterator[None]:
-    """Let ``device="cuda"`` be such a device, for as long as this lasts."""
+    """Let ``device="cuda"`` be such a device, for as long as this lasts, or the real one."""
+    if torch.cuda.is_available():
+        yield
+        return
     with pytest.MonkeyPatch.context() as patch, _Mode():
         patch.setattr(torch, "Generator", Generator)
+        patch.setattr(supervised, "CapturedUpdate", lambda update: update)
+        patch.setattr(supervised, "let_capture", lambda optimizer, captured: None)
         patch.setattr(torch, "save", _saving(torch.save))
         patch.setattr(torch, "load", _loading(torch.load))
         patch.setattr(torch.nn.Module, "_apply", _swapping(torch.nn.Module._apply))

@@ -104,5 +104,13 @@ def set_lenient(module: nn.Module, lenient: bool) -> None:
 
 
 def hidden_from_python(tensor: Tensor) -> bool:
-    """Whether ``torch.vmap`` or the compiler works on ``tensor``: no shape may depend on it."""
+    """Whether ``torch.vmap``, the compiler or a CUDA graph being captured works on ``tensor``.
+
+    No shape may then depend on its values.
+    """
+    return is_traced(tensor) or (tensor.is_cuda and torch.cuda.is_current_stream_capturing())
+
+
+def is_traced(tensor: Tensor) -> bool:
+    """Whether ``torch.vmap`` or the compiler works on ``tensor``."""
     return torch._C._functorch.is_batchedtensor(tensor) or torch.compiler.is_compiling()

@@ -77,11 +77,16 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     ((told, _),) = pieces(said)
     assert told.arguments != first.arguments and told.today["inverse"]["batch_size"] == 512
     assert told.done
-    # Other options, another piece.
-    ((_, changed),) = pieces(
-        options("figure=6", "tasks=[move]", "presets=[strong]", "options_of.all.threads=2")
+    # Other options, another piece; elsewhere, the same.
+    for said, done in (("preset.strong.goal.steps=11", False), ("all.threads=2", True)):
+        ((_, changed),) = pieces(
+            options("figure=6", "tasks=[move]", "presets=[strong]", f"options_of.{said}")
+        )
+        assert changed.file == second.file and changed.done == done
+    ((_, elsewhere),) = pieces(
+        options("figure=6", "tasks=[move]", "presets=[strong]", "device=cuda")
     )
-    assert changed.file == second.file and not changed.done
+    assert elsewhere.done and elsewhere.arguments[-1] == "device=cuda"
 
 
 def test_a_preset_may_have_options_of_one_task_alone(options):

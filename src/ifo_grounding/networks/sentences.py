@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.modules import hidden_from_python
+from ifo_grounding.modules import hidden_from_python, is_traced
 from ifo_grounding.networks.cells import look_up
 from ifo_grounding.networks.config import POOLINGS
 
@@ -33,7 +33,8 @@ def without_padding(tokens: Tensor, words: int) -> Tensor:
 class InstructionEncoder(nn.Module):
     """Base of the encoders of instructions: each distinct instruction of a batch is encoded once.
 
-    Padding, id 0 at the end, changes nothing.
+    Padding, id 0 at the end, changes nothing. On a GPU all instructions are encoded, for to find
+    out which are distinct is to wait for it.
     """
 
     def __init__(self, vocabulary_size: int, embedding: int, hidden: int) -> None:
@@ -46,9 +47,10 @@ class InstructionEncoder(nn.Module):
         """Map token ids [N, L] to features [N, size].
 
         Raises:
-            UserError: where an id lies outside the vocabulary.
+            UserError: where an id lies outside the vocabulary; on a GPU, which would have to be
+                waited for, CUDA raises.
         """
-        if hidden_from_python(tokens):
+        if tokens.is_cuda or hidden_from_python(tokens):
             return self._encode(tokens.long())
         return look_up(*self.distinct(tokens))
 
@@ -119,7 +121,8 @@ class GRUInstructionEncoder(InstructionEncoder):
     hardly heard to begin with; or both of these. An instruction of padding alone is zeros.
 
     The recurrence is written out, where ``nn.GRU`` would do, because packed sequences do not work
-    under ``torch.vmap``, which TorchRL's value estimators use.
+    under ``torch.vmap``, which TorchRL's value estimators use. On a GPU cuDNN computes it where
+    nothing traces it.
 
     It begins with orthogonal recurrences (Saxe et al. 2014) and large weights of words:
     PyTorch's own, which are smaller, would make all sentences nearly the same to begin with.
@@ -167,9 +170,11 @@ class GRUInstructionEncoder(InstructionEncoder):
         lengths = sentence_lengths(tokens)
         step = torch.arange(tokens.shape[1], device=tokens.device)
         table, weight, bias = self._scaled()
+        alive = (step < lengths.unsqueeze(1)).unsqueeze(-1)
+        if tokens.is_cuda and not is_traced(tokens):
+            return self._encode_at_once(tokens, lengths, alive)
         ways = zip(both_ways(tokens, lengths), table, strict=True)
         gates = torch.stack([F.embedding(words, known) for words, known in ways])
-        alive = (step < lengths.unsqueeze(1)).unsqueeze(-1)
         state = total = gates.new_zeros(2, len(tokens), self.hidden)
         # Split once: each slice of its own would get a gradient as large as the whole.
         for given, counts in zip(gates.unbind(2), alive.unbind(1), strict=True):
@@ -177,6 +182,42 @@ class GRUInstructionEncoder(InstructionEncoder):
             state = torch.where(counts, self._cell(given, recalled, state), state)
             total = total if self.pooling == "last" else total + state * counts
         return torch.cat(self._pooled(self._kept(state, total), lengths).unbind(), -1)
+
+    def _encode_at_once(self, tokens: Tensor, lengths: Tensor, alive: Tensor) -> Tensor:
+        """Do as :meth:`_encode` by PyTorch's own GRU, which is one call each way.
+
+        Args:
+            tokens: ids [N, L].
+            lengths: how many of each row count [N].
+            alive: which they are, bool [N, L, 1].
+        """
+        matrices, biases = (
+            [(self.rate * part).contiguous() for part in parts]
+            for parts in (
+                (self.input_weight.mT, self.state_weight.mT),
+                (self.input_bias.squeeze(1), self.state_bias.squeeze(1)),
+            )
+        )
+        begin = self.embedding.weight.new_zeros(1, len(tokens), self.hidden)
+        last = (lengths - 1).clamp_min(0).view(-1, 1, 1).expand(-1, 1, self.hidden)
+        encoded = []
+        for words, *weights in zip(both_ways(tokens, lengths), *matrices, *biases, strict=True):
+            heard = F.embedding(words, self.rate * self.embedding.weight)
+            states, _ = torch.gru(
+                heard,
+                begin,
+                weights,
+                has_biases=True,
+                num_layers=1,
+                dropout=0.0,
+                train=torch.is_grad_enabled(),  # cuDNN then keeps what a gradient needs
+                bidirectional=False,
+                batch_first=True,
+            )
+            counted = states * alive
+            state = counted.gather(1, last).squeeze(1)
+            encoded.append(self._pooled(self._kept(state, counted.sum(1)), lengths))
+        return torch.cat(encoded, -1)
 
     def _encode_distinct(self, tokens: Tensor) -> Tensor:
         """Run the GRU once over what sentences begin with, or end with, alike."""

@@ -67,6 +67,11 @@ class SupervisedLoss(LossModule):
         """The network is used as it is: nothing is copied or made stateless."""
         return False
 
+    @property
+    def capturable(self) -> bool:
+        """Whether all steps do the same, so that a GPU may be told of them once (a CUDA graph)."""
+        return False
+
     def _own_keys(self) -> list[NestedKey]:
         """Return the keys that are read because the network reads them."""
         return list(self.network.in_keys)

@@ -78,6 +78,11 @@ class ImitationLoss(SupervisedLoss):
         self.set_progress(0.0)
 
     @property
+    def capturable(self) -> bool:
+        """Whether all steps do the same: where words are charged for, they are looked at."""
+        return not charges(self.network)
+
+    @property
     def out_keys(self) -> list[NestedKey]:
         """What is written, ``loss_words`` while a network learns that reads word by word."""
         return self._all_out_keys() if self._selected is None else self._selected

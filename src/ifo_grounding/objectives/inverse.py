@@ -42,6 +42,7 @@ class InverseLoss(SupervisedLoss):
 
     default_keys: Any = _AcceptedKeys
     out_keys = ["loss_inverse", "accuracy"]  # noqa: RUF012
+    capturable = True
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
+from ifo_grounding.modules import charges
 from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
 
 
@@ -67,6 +68,11 @@ class RewardLoss(SupervisedLoss):
         if self.n_actions < 2:
             raise UserError("a single action has no different ones to serve as negatives")
         self.generator = generator
+
+    @property
+    def capturable(self) -> bool:
+        """Whether all steps do the same: where words are charged for, they are looked at."""
+        return self.generator is None and not charges(self.network)
 
     def _own_keys(self) -> list[NestedKey]:
         """The network's inputs but for the action, which is the labelled one or another."""

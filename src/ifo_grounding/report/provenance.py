@@ -14,7 +14,7 @@ from ifo_grounding import __version__
 
 
 def provenance() -> dict[str, Any]:
-    """Return what a reader needs to judge a number: versions, commit and machine.
+    """Return what a reader needs to judge a number: versions, commit and machine, with its GPU.
 
     The commit is that of the source checkout, with ``+`` behind it where files differ from it; an
     installed package has none.
@@ -30,6 +30,7 @@ def provenance() -> dict[str, Any]:
         "machine": _processor(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
+        **({"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}),
     }
 
 

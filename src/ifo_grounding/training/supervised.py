@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from ifo_grounding.errors import UserError, at_least_one, check_numbers
 from ifo_grounding.modules import beside, device_of
 from ifo_grounding.networks.transfer import inherited
 from ifo_grounding.seeding import derive
+from ifo_grounding.training.captured import CapturedUpdate, Update, let_capture, set_rate
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
 
 Metrics = dict[str, float]
@@ -162,6 +162,7 @@ def fit(
     progress: bool = False,
     settings: Any = None,
     until: int | None = None,
+    cudagraph: bool = False,
 ) -> list[Metrics]:
     """Minimise a loss module over samples of a replay buffer.
 
@@ -185,6 +186,9 @@ def fit(
         settings: what else decides the result; a checkpoint made with other settings is refused.
         until: steps after which to pause, rounded up to whole iterations; a later call with the
             same checkpoint goes on. None learns to the end.
+        cudagraph: whether a GPU may be told of a step once and repeat it, where the loss is
+            ``capturable``, weights do not decay and samples are drawn at random; for networks that
+            compute the same whatever they see, as those of this library do.
 
     Returns:
         Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
@@ -197,21 +201,30 @@ def fit(
             f"fit samples from a replay buffer, got {type(buffer).__name__}: demonstrations become "
             "one by labelled_buffer(demos, label_demonstrations(demos, inverse).actions)"
         )
-    if (device := device_of(loss)) is not None and device.type != "cpu":
+    device = device_of(loss) or torch.device("cpu")
+    if device.type != "cpu":
         loss.to(device)  # with all that it holds beside its network
     decay = config.decay(len(buffer)) if config.prior else config.weight_decay
     optimizer = make_optimizer(loss.parameters(), config.lr, decay)
     if decay:
         decay_towards_origin(optimizer, loss)
     saved = None
+    sampler = getattr(buffer, "sampler", None)
     if checkpoint:
         parts: dict[str, Any] = {"loss": loss, "optimizer": optimizer}
         parts |= {"held_out": held_out} if held_out else {}
-        sampler = getattr(buffer, "sampler", None)
         if sampler is not None and not isinstance(sampler, RandomSampler):
             parts["sampler"] = sampler  # where it is in its round
         saved = Checkpoint(checkpoint, fingerprint(config, seed, name, settings), **parts)
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
+    alike = getattr(loss, "capturable", False) and not decay and isinstance(sampler, RandomSampler)
+    captured = cudagraph and device.type == "cuda" and alike
+    let_capture(optimizer, captured)
+
+    def step(batch: TensorDictBase) -> dict[str, Tensor]:
+        return update(loss(batch), optimizer, config.grad_clip)
+
+    make_step: Update = CapturedUpdate(step) if captured else step
     generators = generators_of(loss, buffer)
     for generator, drawn in zip(generators, state.get("generators", []), strict=False):
         generator.set_state(drawn)
@@ -224,7 +237,7 @@ def fit(
             torch.manual_seed(derive(seed, name, iteration))
             first = iteration * config.iteration
             steps = range(first, min(first + config.iteration, config.steps))
-            metrics = _iterate(loss, buffer, optimizer, config, steps)
+            metrics = _iterate(loss, buffer, optimizer, config, steps, make_step)
             done = iteration + 1
             if held_out:
                 if done % config.validate_every == 0 or done == iterations:
@@ -265,20 +278,19 @@ def _iterate(
     optimizer: torch.optim.Optimizer,
     config: FitConfig,
     steps: range,
+    make_step: Update,
 ) -> Metrics:
-    sums: dict[str, Tensor] = defaultdict(lambda: torch.zeros(()))
+    sums: dict[str, Tensor] = {}
     start = time.perf_counter()
     for step in steps:
         if callable(set_progress := getattr(loss, "set_progress", None)):
             set_progress(step / config.steps)
-        for group in optimizer.param_groups:
-            group["lr"] = config.lr * config.rate(step)
+        set_rate(optimizer, config.lr * config.rate(step))
         batch = beside(buffer.sample(config.batch_size), loss)
-        for key, value in update(loss(batch), optimizer, config.grad_clip).items():
-            sums[key] = sums[key] + value.cpu()
-    elapsed = time.perf_counter() - start
+        for key, value in make_step(batch).items():  # summed where it lies: a GPU is not waited for
+            sums[key] = sums.get(key, torch.zeros_like(value)) + value
     means = {key: float(value) / len(steps) for key, value in sums.items()}
-    speed = len(steps) * config.batch_size / elapsed
+    speed = len(steps) * config.batch_size / (time.perf_counter() - start)
     return {"step": float(steps.stop), **means, "samples_per_second": speed}
 
 

@@ -1,0 +1,75 @@
+"""A gradient step that a GPU is told of once and then repeats: a CUDA graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+Update = Callable[[TensorDictBase], dict[str, Tensor]]
+WARM_UP = 3
+"""Steps that are made one kernel at a time, in which libraries settle how they compute."""
+
+
+class CapturedUpdate:
+    """Makes the same update of batch after batch, from the fourth on as one CUDA graph.
+
+    A small network's step is hundreds of kernels of some microseconds, and a GPU waits for Python
+    to ask for each. ``tensordict.nn.CudaGraphModule`` does as much, but waits for the GPU at every
+    step, and takes tensordicts from PyTorch's trees for good.
+
+    Args:
+        update: maps a batch to metrics; the same kernels whatever the batch holds, nothing read
+            back, and an optimizer that :func:`let_capture` was told of.
+
+    A metric is overwritten by the next call.
+    """
+
+    def __init__(self, update: Update) -> None:
+        self.update = update
+        self.made = 0
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self.batch: TensorDictBase
+        self.metrics: dict[str, Tensor]
+
+    def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Make the update of a batch, whose tensors have the shapes of the first one's."""
+        self.made += 1
+        if self.made <= WARM_UP:
+            return self._aside(batch)
+        if self.graph is None:
+            self.batch, self.graph = batch.clone(), torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self.graph):
+                self.metrics = self.update(self.batch)
+        else:
+            self.batch.update_(batch)
+        self.graph.replay()
+        return self.metrics
+
+    def _aside(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Make the update on a stream of its own, as what is captured later has to be."""
+        aside = torch.cuda.Stream()
+        aside.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(aside):
+            metrics = self.update(batch)
+        torch.cuda.current_stream().wait_stream(aside)
+        return metrics
+
+
+def let_capture(optimizer: torch.optim.Optimizer, captured: bool) -> None:
+    """Let an optimizer be part of a CUDA graph, or of none, whatever a checkpoint says of it."""
+    for group in optimizer.param_groups:
+        rate = float(group["lr"])
+        group["lr"] = torch.tensor(rate, device=group["params"][0].device) if captured else rate
+        group["capturable"] = captured
+
+
+def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Set the learning rate, in place where a graph reads it."""
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
