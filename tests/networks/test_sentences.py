@@ -8,6 +8,7 @@ from ifo_grounding.networks import ConvInstructionEncoder, GRUInstructionEncoder
 from ifo_grounding.networks.config import POOLINGS
 from ifo_grounding.networks.sentences import beginnings
 from ifo_grounding.tasks import TASKS, VOCABULARY, grammar
+from pretended_gpu import pretended_gpu
 
 
 def sentences(rows: int, length: int = 16, vocabulary: int = 40, seed: int = 0) -> torch.Tensor:
@@ -52,6 +53,26 @@ def test_the_papers_encoder_is_the_bidirectional_gru_of_pytorch_over_packed_sent
     both = [last[0], means[0], last[1], means[1]]
     expected = {"last": [*last], "mean": [*means], "both": both}[pooling]
     torch.testing.assert_close(encoder(tokens), torch.cat(expected, -1))
+
+
+@pytest.mark.parametrize("pooling", POOLINGS)
+def test_a_gpu_reads_sentences_at_once_and_to_the_same_end(pooling):
+    torch.manual_seed(0)
+    encoder = GRUInstructionEncoder(40, embedding=8, hidden=16, rate=0.3, pooling=pooling)
+    tokens = sentences(50)
+    tokens[7] = 0
+    expected = encoder(tokens)
+    asked = torch.autograd.grad(expected.square().sum(), list(encoder.parameters()))
+    with pretended_gpu():
+        encoder, tokens = encoder.to("cuda"), tokens.to("cuda")
+        found = encoder(tokens)
+        given = torch.autograd.grad(found.square().sum(), list(encoder.parameters()))
+        assert found.is_cuda
+        assert encoder(tokens[:0]).shape == (0, encoder.size)
+        found, given = found.cpu(), [each.cpu() for each in given]
+    torch.testing.assert_close(found, expected)
+    for ours, theirs in zip(given, asked, strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-3)
 
 
 def test_an_unknown_pooling_is_refused():

@@ -50,7 +50,7 @@ class InstructionEncoder(nn.Module):
             UserError: where an id lies outside the vocabulary; on a GPU, which would have to be
                 waited for, CUDA raises.
         """
-        if tokens.is_cuda or hidden_from_python(tokens):
+        if (tokens.is_cuda and tokens.numel()) or hidden_from_python(tokens):
             return self._encode(tokens.long())
         return look_up(*self.distinct(tokens))
 
@@ -191,22 +191,20 @@ class GRUInstructionEncoder(InstructionEncoder):
             lengths: how many of each row count [N].
             alive: which they are, bool [N, L, 1].
         """
-        matrices, biases = (
-            [(self.rate * part).contiguous() for part in parts]
-            for parts in (
-                (self.input_weight.mT, self.state_weight.mT),
-                (self.input_bias.squeeze(1), self.state_bias.squeeze(1)),
-            )
-        )
+        of_words = self.rate * self.embedding.weight
+        matrices = self.input_weight.mT, self.state_weight.mT
+        biases = self.input_bias.squeeze(1), self.state_bias.squeeze(1)
         begin = self.embedding.weight.new_zeros(1, len(tokens), self.hidden)
         last = (lengths - 1).clamp_min(0).view(-1, 1, 1).expand(-1, 1, self.hidden)
         encoded = []
-        for words, *weights in zip(both_ways(tokens, lengths), *matrices, *biases, strict=True):
-            heard = F.embedding(words, self.rate * self.embedding.weight)
+        for words, *way in zip(both_ways(tokens, lengths), *matrices, *biases, strict=True):
+            # In one piece of memory, as cuDNN wants them.
+            flat = self.rate * torch.cat([part.flatten() for part in way])
+            pieces = flat.split([part.numel() for part in way])
             states, _ = torch.gru(
-                heard,
+                F.embedding(words, of_words),
                 begin,
-                weights,
+                [piece.view(part.shape) for piece, part in zip(pieces, way, strict=True)],
                 has_biases=True,
                 num_layers=1,
                 dropout=0.0,
