@@ -2,7 +2,7 @@
 
 import sys
 
-from _shared import open_run, plain, result_file
+from _shared import machines, open_run, plain, result_file
 from omegaconf import DictConfig
 
 from ifo_grounding.files import write_json
@@ -19,6 +19,7 @@ def write_result(options: DictConfig, results: dict, command: str) -> dict:
         "options": plain(options),
         "seconds": round(sum(stages.values()), 1),
         "stages": stages,
+        "machines": {stage: on for stage, on in machines(run).items() if stage in stages},
         "provenance": provenance(),
         "results": results,
     }

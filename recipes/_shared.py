@@ -20,6 +20,7 @@ from ifo_grounding.data import Demonstrations, LabelReport, recombined
 from ifo_grounding.data.listing import LIST, read_list
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
+from ifo_grounding.machine import machine_of
 from ifo_grounding.report import format_cell, text_table
 from ifo_grounding.training.run import Run, Stage
 
@@ -44,6 +45,8 @@ RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
 """Options that decide no result."""
 MADE = "options.json"
 """Options that a run was made with."""
+MACHINES = "machines.json"
+"""On which machines its stages were done."""
 PHASE_2 = (
     "self_examine",
     "continue_imitation",
@@ -114,6 +117,8 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
         doing = "running, for its options or an earlier stage are not what they were"
     else:
         doing = "running"
+    if stage.result is None:
+        keep_machine(stage, options.device)
     print(f"{name}: {doing}", flush=True)
     return stage
 
@@ -122,6 +127,20 @@ def keep_options(run: Run, options: DictConfig, names: Sequence[str]) -> None:
     """Keep with a run with which options it was made: ``names`` are those of its latest stage."""
     made = made_with(run) or plain(options)
     write_json(run / MADE, {**made, **{name: plain(options[name]) for name in names}})
+
+
+def keep_machine(stage: Stage, device: str) -> None:
+    """Keep with a run where a stage is done: here, and where it was begun."""
+    noted = machines(stage.run)
+    before = noted.get(stage.name, []) if stage.continues else []
+    here = [*before, machine_of(device)]
+    write_json(stage.run / MACHINES, {**noted, stage.name: list(dict.fromkeys(here))})
+
+
+def machines(run: Run) -> dict[str, list[str]]:
+    """Return on which machines the stages of a run were done; older runs do not say."""
+    path = run / MACHINES
+    return read_json(path) if path.exists() else {}
 
 
 def made_with(run: Run) -> dict[str, Any]:

@@ -203,3 +203,27 @@ def test_the_policy_learns_in_the_smallest_budget_too(compose, preset):
     usual = {"strong": 3, "film": 3, "paper": 2}
     usually = compose("two_phase", f"preset={preset}", "budget=full").self_examine
     assert usually.value_warmup == usual[preset]
+
+
+def test_a_run_says_where_each_stage_was_done(compose, monkeypatch):
+    import _shared
+    from record_demonstrations import record
+
+    def on(machine):
+        monkeypatch.setattr(_shared, "machine_of", lambda device: machine)
+
+    options = compose("two_phase", "demonstrations.n=20")
+    on("a laptop")
+    record(options)
+    stage = _shared.open_stage(options, "imitate", ["imitate"], needs=[])
+    stage.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    stage.checkpoint.write_text("begun")
+    on("a GPU")
+    record(options)  # done before
+    _shared.open_stage(options, "imitate", ["imitate"], needs=[])
+    run = _shared.open_run(options)
+    done = {"record_demonstrations": ["a laptop"], "imitate": ["a laptop", "a GPU"]}
+    assert _shared.machines(run) == done
+    stage.checkpoint.unlink()  # it begins anew
+    _shared.open_stage(options, "imitate", ["imitate"], needs=[])
+    assert _shared.machines(run) == {**done, "imitate": ["a GPU"]}

@@ -136,6 +136,7 @@ class Stage:
     Attributes:
         settings: fingerprint of all that decides its result.
         result: what :meth:`finish` was given, or None where the stage is still to be done.
+        continues: whether it was begun before, and left a checkpoint.
         checkpoint: file for its checkpoint.
     """
 
@@ -149,7 +150,7 @@ class Stage:
             self.result = record["result"]
         self.checkpoint = run.folder / "checkpoints" / f"{name}.pt"
         left = [path for path in self.checkpoints() if path.exists()]
-        self._continues = bool(left)
+        self.continues = bool(left)
         self._start = time.monotonic() - (sum(map(spent, left)) if self.result is None else 0.0)
 
     def checkpoints(self) -> list[Path]:
@@ -190,7 +191,7 @@ class Stage:
         from torchrl.record.loggers import get_logger
 
         folder = self.run.folder / "logs"
-        goes_on = self._continues
+        goes_on = self.continues
         if self.run.logger != "wandb":
             made_of = folder / self.name / "settings"
             goes_on &= made_of.exists() and made_of.read_text() == self.settings
