@@ -1,6 +1,6 @@
 """Write the table of speeds: ``python docs/make_speed.py`` after ``make bench``.
 
-Reads ``results/bench/*.json`` and writes the part of ``docs/speed.md`` between its two marks, and
+Reads ``results/bench/*.json`` and writes the parts of ``docs/speed.md`` between its marks, and
 the picture of how costs grow. A test checks that the table is up to date.
 """
 
@@ -92,18 +92,25 @@ def fact(value: float) -> str:
     return f"{value:,.0f}" if value == round(value) else f"{value:,.4g}"
 
 
-def section() -> str:
-    """Return the tables."""
-    rows = measured()
-    if not rows:
-        return "Not run."
+def sections() -> dict[str, str]:
+    """Return the parts of the page: of two cores, for which speeds are asked, and of a GPU."""
+    there = {name: {**row, "reach": {}} for name, row in measured("cuda").items()}
+    found = {"speed": measured(), "speed-gpu": there}
+    return {mark: tables(rows) if rows else "Not run." for mark, rows in found.items()}
+
+
+def tables(rows: dict[str, dict[str, Any]]) -> str:
+    """Return the tables of what was measured on one device."""
     made: dict[str, dict[str, None]] = {}
     for row in rows.values():
         of = row["provenance"]
         machine = f"{of['machine']}, {of['threads']} threads, torch {of['torch']}"
+        machine = f"{of['gpu']} beside {machine}" if of["device"] != "cpu" else machine
         made.setdefault(machine, {})[f"`{of['commit']}`"] = None
     machines = [f"{machine}, commits {', '.join(commits)}" for machine, commits in made.items()]
     rates = [shown for row in rows.values() if row["rates"] for shown in lines(row)]
+    if not any(shown["asked"] for shown in rates):
+        rates = [{k: v for k, v in shown.items() if k != "asked"} for shown in rates]
     notes = [f"- {row['name']}: {row['note']}." for row in rows.values() if row["note"]]
     facts = [
         {"what": row["name"], "measured": name, "value": fact(value)}
@@ -137,7 +144,10 @@ def growth() -> Figure | None:
 
 def written() -> dict[Path, str]:
     """Return what the page should say."""
-    return {PAGE: renewed(PAGE.read_text(), "speed", f"\n{section()}\n")}
+    text = PAGE.read_text()
+    for mark, part in sections().items():
+        text = renewed(text, mark, f"\n{part}\n")
+    return {PAGE: text}
 
 
 def main() -> None:
