@@ -14,7 +14,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ifo_grounding._recipes import recipes_folder
+from ifo_grounding._folder import recipes_folder
 from ifo_grounding.files import atomic_write, read_json
 from ifo_grounding.report import (
     audit_figure,

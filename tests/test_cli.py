@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from ifo_grounding import _recipes, cli
-from ifo_grounding._recipes import check_options, recipes_folder
+from ifo_grounding import _folder, cli
+from ifo_grounding._folder import recipes_folder
+from ifo_grounding._overrides import check_options
 from ifo_grounding.errors import UserError
 
 RECIPE = """
@@ -68,8 +69,7 @@ def recipes(tmp_path, monkeypatch):
     for name, width in (("strong", 64), ("paper", 32)):
         text = f"# @package _global_\nwidth: {width}\n"
         (folder / "conf" / "preset" / f"{name}.yaml").write_text(text)
-    monkeypatch.setattr(_recipes, "recipes_folder", lambda: folder)
-    monkeypatch.setattr(cli, "recipes_folder", lambda: folder)
+    monkeypatch.setattr(_folder, "recipes_folder", lambda: folder)
     monkeypatch.delenv(FULL_ERROR, raising=False)
     empty = tmp_path / "empty"
     empty.mkdir()
@@ -190,7 +190,7 @@ def test_help_of_a_recipe_lists_its_options(recipes, capsys):
 
 @pytest.mark.parametrize("chosen", [[], ["preset=paper", "budget=full"], ["world=babyai"]])
 def test_help_says_what_every_option_means(capsys, chosen):
-    for name in _recipes.recipe_names():
+    for name in _folder.recipe_names():
         said = [] if name == "reproduce" else chosen
         assert run("run", name, *said, "--help") == 0
         printed = capsys.readouterr().out
@@ -248,7 +248,7 @@ def test_help_and_version(capsys):
 
 
 def test_every_command_has_its_recipe_and_every_recipe_its_options():
-    names = _recipes.recipe_names()
+    names = _folder.recipe_names()
     assert {recipe for recipe, _ in cli.COMMANDS.values()} <= set(names)
     for name in names:
         check_options(recipes_folder() / "conf", name, [])
@@ -257,7 +257,7 @@ def test_every_command_has_its_recipe_and_every_recipe_its_options():
 
 
 def test_an_installation_without_recipes_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(_recipes, "__file__", str(tmp_path / "a" / "b" / "_recipes.py"))
+    monkeypatch.setattr(_folder, "__file__", str(tmp_path / "a" / "b" / "_folder.py"))
     with pytest.raises(UserError, match="install ifo-grounding again"):
         recipes_folder()
 

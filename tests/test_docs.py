@@ -11,7 +11,8 @@ import torch
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import objectives
-from ifo_grounding._recipes import check_options, recipe_names, recipes_folder
+from ifo_grounding._folder import recipe_names, recipes_folder
+from ifo_grounding._overrides import check_options
 from ifo_grounding.cli import resolve
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.networks import (

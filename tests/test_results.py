@@ -6,7 +6,7 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from ifo_grounding._recipes import recipes_folder
+from ifo_grounding._folder import recipes_folder
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.stats import wilson
 

@@ -31,7 +31,7 @@ def help_text(conf: Path, name: str, overrides: Sequence[str] = ()) -> str:
         name: of the recipe.
         overrides: ``name=value``, checked before.
 
-    >>> from ifo_grounding._recipes import recipes_folder
+    >>> from ifo_grounding._folder import recipes_folder
     >>> text = help_text(recipes_folder() / "conf", "imitate", ["seed=3"])
     >>> [line.split() for line in text.splitlines() if line.startswith("seed")]
     [['seed:', '3', '#', 'of', 'all', 'randomness']]

@@ -7,7 +7,9 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from ifo_grounding._recipes import one_line_errors, recipe_main, recipe_names, recipes_folder
+from ifo_grounding import _folder
+from ifo_grounding._folder import recipe_names
+from ifo_grounding._recipes import one_line_errors, recipe_main
 from ifo_grounding.errors import UserError, did_you_mean
 
 __all__ = ["COMMANDS", "main", "recipe_main"]
@@ -71,10 +73,10 @@ def resolve(command: str, rest: Sequence[str]) -> tuple[str, list[str]]:
 
 def run_recipe(name: str, options: Sequence[str]) -> None:
     """Run a recipe's script in this process, as ``python recipes/<name>.py <options>`` does."""
-    script = str(recipes_folder() / f"{name}.py")
+    script = str(_folder.recipes_folder() / f"{name}.py")
     argv, path = sys.argv, list(sys.path)
     sys.argv = [script, *options]
-    sys.path.insert(0, str(recipes_folder()))
+    sys.path.insert(0, str(_folder.recipes_folder()))
     try:
         runpy.run_path(script, run_name="__main__")
     finally:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from ifo_grounding._recipes import recipes_folder
+from ifo_grounding._folder import recipes_folder
 from ifo_grounding.files import read_json
 
 STAGES = ["collect_transitions", "train_inverse", "record_demonstrations", "label"]
