@@ -79,9 +79,12 @@ def learn(
 
 def decode_on(device: str, buffer: ReplayBuffer) -> None:
     """Let a buffer keep its frames on a GPU and decode them there, unless they are pixels."""
-    parts = [part for part in buffer.transform.modules() if isinstance(part, FrameDecoder)]
-    if torch.device(device).type == "cuda" and all(part.words is not None for part in parts):
-        buffer.transform.to(device)
+    transform = getattr(buffer, "transform", None)  # of several buffers there is none
+    if transform is None or torch.device(device).type == "cpu":
+        return
+    parts = [part for part in transform.modules() if isinstance(part, FrameDecoder)]
+    if all(part.words is not None for part in parts):
+        transform.to(device)
 
 
 def beginning_seed(options: DictConfig, number: int) -> int:

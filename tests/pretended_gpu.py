@@ -62,6 +62,7 @@ def pretended_gpu() -> Iterator[None]:
             "is_available": True,
             "device_count": 1,
             "current_device": 0,
+            "get_device_name": "a pretended GPU",
             "synchronize": None,
             "is_bf16_supported": False,
             "manual_seed_all": None,

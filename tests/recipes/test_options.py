@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from ifo_grounding.cli import run_recipe
-from ifo_grounding.data import record_demonstrations
+from ifo_grounding.data import Demonstrations, first_frame_buffer, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
+from pretended_gpu import pretended_gpu
 
 STAGES_OF_PHASE_1 = (
     "record_demonstrations",
@@ -227,3 +228,23 @@ def test_a_run_says_where_each_stage_was_done(compose, monkeypatch):
     stage.checkpoint.unlink()  # it begins anew
     _shared.open_stage(options, "imitate", ["imitate"], needs=[])
     assert _shared.machines(run) == {**done, "imitate": ["a GPU"]}
+
+
+def test_frames_of_tiles_are_decoded_on_a_gpu(recipes):
+    from _learning import decode_on
+    from controls import Both
+    from tensordict import TensorDict
+
+    demos = record_demonstrations("move", 3, seed=0)
+    with pretended_gpu():
+        buffer = first_frame_buffer(demos)
+        decode_on("cpu", buffer)
+        assert not buffer.sample(2)["pixels"].is_cuda
+        decode_on("cuda", buffer)
+        assert buffer.sample(2)["pixels"].is_cuda
+        pixels = demos.first_frames([0]).flatten(0, -4)
+        raw = Demonstrations.from_arrays([torch.rand(2, 3, 9, 9).mul(255).byte()], ["go up"])
+        plain = first_frame_buffer(raw)  # whose table of frames may be larger than a GPU
+        decode_on("cuda", plain)
+        assert not plain.sample(2)["pixels"].is_cuda
+        decode_on("cuda", Both(buffer, TensorDict({"pixels": pixels}, [1])))

@@ -8,6 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from ifo_grounding.errors import UserError
+
 Update = Callable[[TensorDictBase], dict[str, Tensor]]
 WARM_UP = 3
 """Steps that are made one kernel at a time, in which libraries settle how they compute."""
@@ -25,6 +27,9 @@ class CapturedUpdate:
             back, and an optimizer that :func:`let_capture` was told of.
 
     A metric is overwritten by the next call.
+
+    Raises:
+        UserError: where the update cannot be captured.
     """
 
     def __init__(self, update: Update) -> None:
@@ -41,8 +46,15 @@ class CapturedUpdate:
             return self._aside(batch)
         if self.graph is None:
             self.batch, self.graph = batch.clone(), torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self.graph):
-                self.metrics = self.update(self.batch)
+            try:
+                with torch.cuda.graph(self.graph):
+                    self.metrics = self.update(self.batch)
+            except RuntimeError as error:
+                raise UserError(
+                    f"this step cannot be one CUDA graph ({str(error).splitlines()[0]}): its "
+                    "network reads something back, or computes other shapes for other batches; "
+                    "pass cudagraph=False"
+                ) from error
         else:
             self.batch.update_(batch)
         self.graph.replay()
