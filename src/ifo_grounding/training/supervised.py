@@ -217,8 +217,9 @@ def fit(
             parts["sampler"] = sampler  # where it is in its round
         saved = Checkpoint(checkpoint, fingerprint(config, seed, name, settings), **parts)
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
-    alike = getattr(loss, "capturable", False) and not decay and isinstance(sampler, RandomSampler)
-    captured = cudagraph and device.type == "cuda" and alike
+    same_steps = getattr(loss, "capturable", False) and not decay
+    same_sizes = isinstance(sampler, RandomSampler)
+    captured = cudagraph and device.type == "cuda" and same_steps and same_sizes
     let_capture(optimizer, captured)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
@@ -288,7 +289,7 @@ def _iterate(
         set_rate(optimizer, config.lr * config.rate(step))
         batch = beside(buffer.sample(config.batch_size), loss)
         for key, value in make_step(batch).items():  # summed where it lies: a GPU is not waited for
-            sums[key] = sums.get(key, torch.zeros_like(value)) + value
+            sums[key] = sums[key] + value if key in sums else value.clone()
     means = {key: float(value) / len(steps) for key, value in sums.items()}
     speed = len(steps) * config.batch_size / (time.perf_counter() - start)
     return {"step": float(steps.stop), **means, "samples_per_second": speed}
