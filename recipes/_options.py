@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from _learning import fit_config, self_examination_config
-from _shared import RUNNING, changed_networks, check_same, made_with, plain
+from _shared import OF_CHOICE, RUNNING, changed_networks, check_same, made_with, plain
 from _values import check_values
 from _worlds import Grid, open_world
 from hydra.core.hydra_config import HydraConfig
@@ -25,13 +25,7 @@ LEARNED = ("inverse", "imitate", "instruction", "reward", "goal")
 """Sections that say how a network learns."""
 OF_A_COMMAND = ("run", "base", "results", "variant", *RUNNING)
 """Options that say nothing about what a run has learned."""
-OF_EVALUATION = (
-    "evaluate",
-    "instruction.threshold",
-    "instruction.candidates",
-    "instruction.choose",
-    "self_examine.recombine",
-)
+OF_EVALUATION = ("evaluate", *OF_CHOICE, "self_examine.recombine")
 """Options that may be others when what was learned is evaluated."""
 GROUPS = {"preset": ["network"], "world": ["simulator", "world"]}
 """Choices of several options at once, and what they decide of what was learned."""

@@ -41,6 +41,8 @@ OF_LOOKS = ("evaluate", "evaluate_references")
 """Stages that look at what a run has made."""
 PLACE = ("task", "simulator")
 """Options that all stages of a run share."""
+OF_CHOICE = ("instruction.threshold", "instruction.candidates", "instruction.choose")
+"""Options that decide which instructions are chosen, and nothing of what chooses."""
 RUNNING = ("checkpoint_seconds", "logger", "progress", "threads", "device")
 """Options that decide no result."""
 MADE = "options.json"
@@ -92,8 +94,16 @@ def open_run(options: DictConfig) -> Run:
     return run
 
 
-def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[str]) -> Stage:
+def open_stage(
+    options: DictConfig,
+    name: str,
+    sections: list[str],
+    needs: list[str],
+    without: Sequence[str] = (),
+) -> Stage:
     """Return a stage that is decided by options or sections of them, the seed and the world.
+
+    ``without`` names options of these sections, such as ``instruction.choose``, that do not count.
 
     Raises:
         UserError: where the stages that it needs are of another task or world.
@@ -106,6 +116,9 @@ def open_stage(options: DictConfig, name: str, sections: list[str], needs: list[
             check_same(options, place, made[place], "say so")
     common = ["task", "seed", "network", "world"]
     decisive = {key: plain(OmegaConf.select(options, key)) for key in [*common, *sections]}
+    for option in without:
+        section, _, key = option.partition(".")
+        decisive[section].pop(key)
     if changed := changed_networks(options):
         decisive["networks"] = changed  # only then: runs without any go on as they were
     stage = run.stage(name, decisive, needs)

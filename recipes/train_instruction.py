@@ -4,7 +4,14 @@ import math
 
 import torch
 from _learning import Beginning, beginning_seed
-from _shared import CLASSIFIER, load_demonstrations, open_stage, starting_policy, tell
+from _shared import (
+    CLASSIFIER,
+    OF_CHOICE,
+    load_demonstrations,
+    open_stage,
+    starting_policy,
+    tell,
+)
 from _worlds import build, context_of, open_world
 from omegaconf import DictConfig
 from torch import Tensor
@@ -25,7 +32,7 @@ def train_instruction(options: DictConfig) -> dict:
         "record_demonstrations",
         *(["imitate"] if options.instruction.init_from_policy else []),
     ]
-    stage = open_stage(options, "train_instruction", ["instruction"], needs)
+    stage = open_stage(options, "train_instruction", ["instruction"], needs, without=OF_CHOICE)
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)

@@ -248,3 +248,19 @@ def test_frames_of_tiles_are_decoded_on_a_gpu(recipes):
         decode_on("cuda", plain)
         assert not plain.sample(2)["pixels"].is_cuda
         decode_on("cuda", Both(buffer, TensorDict({"pixels": pixels}, [1])))
+
+
+def test_how_instructions_are_chosen_decides_nothing_of_what_chooses(compose):
+    from _shared import OF_CHOICE, open_stage
+
+    def judge(*said):
+        options = compose("two_phase", *said)
+        return open_stage(options, "train_instruction", ["instruction"], [], without=OF_CHOICE)
+
+    judge().finish({"loss": 0.5})
+    assert judge("instruction.threshold=0.4", "instruction.choose=random").result == {"loss": 0.5}
+    assert judge("instruction.negatives=9").result is None
+    options = compose("two_phase", "instruction.threshold=0.4")
+    practice = ["self_examine", "instruction"]
+    open_stage(compose("two_phase"), "self_examine", practice, []).finish({})
+    assert open_stage(options, "self_examine", practice, []).result is None
