@@ -88,8 +88,8 @@ def open_run(options: DictConfig) -> Run:
         torch.set_num_threads(options.threads)
     run = Run(options.run, options.logger)
     if options.base:
-        if not run.begun:
-            (run / MADE).unlink(missing_ok=True)  # of a call that was refused
+        for name in () if run.begun else (MADE, MACHINES):
+            (run / name).unlink(missing_ok=True)  # of a call that was refused
         run.take_over(Run(options.base), without=PHASE_2)
     return run
 
