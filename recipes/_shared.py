@@ -122,16 +122,16 @@ def open_stage(
     if changed := changed_networks(options):
         decisive["networks"] = changed  # only then: runs without any go on as they were
     stage = run.stage(name, decisive, needs)
-    if stage.result is None and name not in OF_LOOKS:
-        keep_options(run, options, ["simulator", *common, "networks", *sections])
+    if stage.result is None:
+        keep_machine(stage, options.device)
+        if name not in OF_LOOKS:
+            keep_options(run, options, ["simulator", *common, "networks", *sections])
     if stage.result is not None:
         doing = "done before"
     elif run.record(name):
         doing = "running, for its options or an earlier stage are not what they were"
     else:
         doing = "running"
-    if stage.result is None:
-        keep_machine(stage, options.device)
     print(f"{name}: {doing}", flush=True)
     return stage
 
