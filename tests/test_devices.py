@@ -8,9 +8,21 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
 
-from ifo_grounding.data import Demonstrations, collect_transitions, record_demonstrations
+from ifo_grounding.data import (
+    Demonstrations,
+    collect_transitions,
+    first_frame_buffer,
+    goal_buffer,
+    record_demonstrations,
+)
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.networks import make_instruction_classifier, make_policy, make_reward_model
+from ifo_grounding.networks import (
+    make_goal_judge,
+    make_instruction_classifier,
+    make_policy,
+    make_reward_model,
+)
+from ifo_grounding.objectives import GoalLoss, InstructionLoss
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 from pretended_gpu import pretended_gpu
 
@@ -67,3 +79,27 @@ def test_frames_of_a_gpu_become_demonstrations():
         assert torch.equal(made.first_frames(which)[0], frames[2][0].cpu())
         assert torch.equal(made.first_frames([2, 0]), made.first_frames(which))
         assert torch.equal(made[which].lengths, made.lengths[[2, 0]])
+
+
+@pytest.mark.parametrize("kind", ["instruction", "goal"])
+def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
+    """There neither distinct instructions nor final frames are looked for."""
+    demos = record_demonstrations("move", 40, seed=0)
+    pool = demos.pool()[:2]  # of two, the other one is drawn
+    demos = demos[torch.nonzero((demos.tokens[:, None] == pool).all(-1).any(-1)).squeeze(1)]
+
+    def losses(device):
+        options = {"seed": 0, "device": device, "precision": "fp32"}
+        if kind == "goal":
+            loss = GoalLoss(make_goal_judge(demos, "paper", **options), pool, negatives=1)
+            batch = goal_buffer(demos)[:]
+        else:
+            network = make_instruction_classifier(demos, "paper", **options)
+            loss = InstructionLoss(network, pool, unlabelled="mixture", near=0.5)
+            batch = first_frame_buffer(demos)[:]
+        out = loss.to(device).eval()(batch.to(device))
+        return {name: float(value) for name, value in out.items()}
+
+    here = losses("cpu")
+    with pretended_gpu():
+        assert losses("cuda") == pytest.approx(here, abs=1e-4)

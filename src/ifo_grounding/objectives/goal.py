@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding.errors import at_least_one
+from ifo_grounding.modules import charges
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
@@ -85,6 +86,12 @@ class GoalLoss(SupervisedLoss):
         """Say which share of training is done, in [0, 1]; until told, training counts as late."""
         self.negatives.progress = fraction
 
+    @property
+    def capturable(self) -> bool:
+        """Whether all steps do the same: how many negatives to drop would have to be counted."""
+        same = self.negatives.keeps_all and self.negatives.generator is None
+        return same and not charges(self.network)
+
     def _extra_keys(self) -> list[NestedKey]:
         return [self.tensor_keys.final]
 
@@ -96,23 +103,26 @@ class GoalLoss(SupervisedLoss):
         final = batch.get(self.tensor_keys.final).reshape(-1).bool()
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
-            own, other = pair_scores(self.network, batch[final], others[final])
-            early, _ = pair_scores(self.network, batch[~final], others[~final, :0])
+            if final.is_cuda and self.capturable:  # all in every way: to count them is to wait
+                own, other = pair_scores(self.network, batch, others)
+                early, last, before = own, final, ~final
+                told = final.unsqueeze(1).expand_as(other)
+            else:
+                own, other = pair_scores(self.network, batch[final], others[final])
+                early, _ = pair_scores(self.network, batch[~final], others[~final, :0])
+                last, before, told = (
+                    torch.ones_like(each, dtype=torch.bool) for each in (own, early, other)
+                )
         if self.training:
             self.negatives.watch(own, other)
-        kept = self.negatives.keep(other)
-        finished = mean_or_zero(F.softplus(-own))
-        unfinished = mean_or_zero(F.softplus(early))
+        kept = told & self.negatives.keep(other)
+        finished = masked_mean(F.softplus(-own), last)
+        unfinished = masked_mean(F.softplus(early), before)
         elsewhere = masked_mean(F.softplus(other), kept)
         return scalars(
             loss_goal=(finished + (unfinished + elsewhere) / 2) / 2,
-            final_probability=mean_or_zero(own.detach().sigmoid()),
-            unfinished_probability=mean_or_zero(early.detach().sigmoid()),
-            negative_probability=mean_or_zero(other.detach().sigmoid()),
-            removed=mean_or_zero((~kept).float()),
+            final_probability=masked_mean(own.detach().sigmoid(), last),
+            unfinished_probability=masked_mean(early.detach().sigmoid(), before),
+            negative_probability=masked_mean(other.detach().sigmoid(), told),
+            removed=masked_mean((~kept).float(), told),
         )
-
-
-def mean_or_zero(values: Tensor) -> Tensor:
-    """Return the mean of ``values``, 0 where there are none."""
-    return masked_mean(values, torch.ones_like(values, dtype=torch.bool))

@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.modules import set_lenient
+from ifo_grounding.modules import charges, set_lenient
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import (
     ESTIMATED,
@@ -154,12 +154,17 @@ class InstructionLoss(SupervisedLoss):
                 f"{type(self.network.module).__name__} has no method expect(share, mixed), which "
                 "shifts its logits: see networks.PairScorer.expect"
             )
-        self.negatives.heed()  # what a checkpoint brought back
         share = max(self.negatives.suitable_share(), 1 / len(self.negatives.pool))
         kept = self.unlabelled == "removal" and not self.negatives.share
         mixed = kept or self.unlabelled == "mixture"
         expect(share, mixed)
         return share
+
+    @property
+    def capturable(self) -> bool:
+        """Whether all steps do the same: how many negatives to drop would have to be counted."""
+        same = self.unlabelled == "mixture" or self.negatives.keeps_all
+        return same and self.negatives.generator is None and not charges(self.network)
 
     def _extra_keys(self) -> list[NestedKey]:
         return []

@@ -77,7 +77,7 @@ class NegativeInstructions(nn.Module):
             raise UserError("pool holds fewer than two different instructions: no negatives exist")
         self.register_buffer("pool", distinct, persistent=False)
         self.register_buffer("bound", torch.ones(()))
-        self.removal_rate = 0.0 if estimated else float(removal_rate)
+        self.given = 0.0 if estimated else float(removal_rate)
         self.estimate = MixtureEstimate() if estimated else None
         self.warmup, self.near = warmup, near
         self.generator = generator
@@ -119,7 +119,8 @@ class NegativeInstructions(nn.Module):
 
     def _nearby(self, instruction: Tensor, count: int) -> Tensor:
         """Draw uniformly among the nearest others."""
-        differing = torch.stack([(self.pool != row).sum(-1) for row in instruction])
+        places = zip(instruction.T, self.pool.T, strict=True)  # place by place, to bound memory
+        differing = sum(own.unsqueeze(1) != words for own, words in places)
         differing = torch.where(differing == 0, self.pool.shape[1] + 1, differing)
         nearest = differing.topk(min(NEAREST, len(self.pool) - 1), largest=False).indices
         chosen = self.randint(0, nearest.shape[1], (len(instruction), count))
@@ -135,14 +136,20 @@ class NegativeInstructions(nn.Module):
             count = other.shape[-1]
             as_far = self.estimate.ratio * own.numel() * count // max(other.numel(), 1)
             self.estimate.add(own, other[..., : max(as_far, 1)])
-            self.heed()
 
-    def heed(self) -> None:
-        """Remove the share that is estimated by now, where it is estimated."""
-        if self.estimate is not None:
-            share = self.suitable_share()
-            few = self.undecided and share < LEAST_REMOVED
-            self.removal_rate = 0.0 if few else min(share, float(self.bound))
+    @property
+    def removal_rate(self) -> float:
+        """Share of negatives to drop after the warm-up: as given, or as estimated by now."""
+        if self.estimate is None:
+            return self.given
+        share = self.suitable_share()
+        few = self.undecided and share < LEAST_REMOVED
+        return 0.0 if few else min(share, float(self.bound))
+
+    @property
+    def keeps_all(self) -> bool:
+        """Whether none is ever dropped."""
+        return self.estimate is None and not self.given
 
     def suitable_share(self) -> float:
         """Return the share of suitable ones as it is estimated by now, at most ``MOST_REMOVED``.
@@ -167,13 +174,13 @@ class NegativeInstructions(nn.Module):
 
     def keep(self, scores: Tensor) -> Tensor:
         """Return a mask of ``scores`` [*] without the top share that is likely suitable."""
-        drop = int(self.share * scores.numel())
-        over = self.progress >= self.warmup
+        share, over = self.share, self.progress >= self.warmup
         if self.training and over and self.estimate is not None and self.undecided:
-            self.bound.fill_(self.share)
-        mask = torch.ones(scores.numel(), dtype=torch.bool, device=scores.device)
-        mask[scores.detach().flatten().topk(drop).indices] = False
-        return mask.reshape(scores.shape)
+            self.bound.fill_(share)
+        mask = torch.ones_like(scores, dtype=torch.bool)
+        if drop := int(share * scores.numel()):
+            mask.view(-1)[scores.detach().flatten().topk(drop).indices] = False
+        return mask
 
     def randint(self, low: int, high: int, shape: tuple[int, ...]) -> Tensor:
         """Draw integers from ``low`` up to ``high``, which is left out."""
@@ -188,7 +195,8 @@ def pair_scores(
     """Score each row's own instruction and others: logits [N] and [N, K].
 
     A network with ``encode_scenes``, ``encode_instruction`` and ``score_candidates`` encodes each
-    row's images and each distinct instruction once; any other runs once per pair.
+    row's images and each distinct instruction once; any other runs once per pair. On a GPU every
+    instruction is encoded where scenes share nothing either: to find the distinct ones is to wait.
 
     Args:
         network: images and an instruction, its last input, to a logit [*B, 1].
@@ -200,12 +208,14 @@ def pair_scores(
     count = both.shape[1]
     parts = ("encode_scenes", "encode_instruction", "score_candidates")
     if all(hasattr(network, name) for name in parts):
-        tokens, which = distinct_rows(both.flatten(0, 1).long())
-        scores = network.score_candidates(
-            network.encode_scenes(*(batch.get(key) for key in pixel_keys)),
-            network.encode_instruction(tokens),
-            which.view(-1, count),
-        )
+        scenes = network.encode_scenes(*(batch.get(key) for key in pixel_keys))
+        tokens = both.flatten(0, 1).long()
+        if tokens.is_cuda and isinstance(scenes, Tensor):
+            which = torch.arange(len(tokens), device=tokens.device)
+        else:
+            tokens, which = distinct_rows(tokens)
+        words = network.encode_instruction(tokens)
+        scores = network.score_candidates(scenes, words, which.view(-1, count))
     else:
         rows = torch.arange(len(both), device=both.device).repeat_interleave(count)
         pairs = batch.select(*pixel_keys)[rows].set(instruction_key, both.flatten(0, 1))
