@@ -19,6 +19,8 @@ classifier would remove are mostly the hardest true ones."""
 
 NEAREST = 64
 """How many instructions count as near in their words."""
+WORDS_AT_ONCE = 1 << 20
+"""Words that are compared together, to bound memory."""
 
 
 class NegativeInstructions(nn.Module):
@@ -82,6 +84,7 @@ class NegativeInstructions(nn.Module):
         self.warmup, self.near = warmup, near
         self.generator = generator
         self.progress = 1.0
+        self.neighbours: dict[tuple[int, ...], Tensor] = {}
 
     def draw(self, instruction: Tensor, count: int) -> Tensor:
         """Draw ``count`` instructions per row of [N, L], other than the row's own: [N, K, L].
@@ -119,12 +122,25 @@ class NegativeInstructions(nn.Module):
 
     def _nearby(self, instruction: Tensor, count: int) -> Tensor:
         """Draw uniformly among the nearest others."""
-        places = zip(instruction.T, self.pool.T, strict=True)  # place by place, to bound memory
-        differing = sum(own.unsqueeze(1) != words for own, words in places)
-        differing = torch.where(differing == 0, self.pool.shape[1] + 1, differing)
-        nearest = differing.topk(min(NEAREST, len(self.pool) - 1), largest=False).indices
+        nearest = self._nearest(instruction) if instruction.is_cuda else self._known(instruction)
         chosen = self.randint(0, nearest.shape[1], (len(instruction), count))
         return self.pool[nearest.gather(1, chosen)]
+
+    def _known(self, instruction: Tensor) -> Tensor:
+        """Return what :meth:`_nearest` does, which is found once for each distinct instruction."""
+        rows = [tuple(row) for row in instruction.tolist()]
+        new = [place for place, row in enumerate(rows) if row not in self.neighbours]
+        if new:
+            found = self._nearest(instruction[new])
+            self.neighbours |= {rows[place]: each for place, each in zip(new, found, strict=True)}
+        return torch.stack([self.neighbours[row] for row in rows])
+
+    def _nearest(self, instruction: Tensor) -> Tensor:
+        """Return which others differ from each of [N, L] in the fewest words: indices [N, M]."""
+        some = instruction.split(max(1, WORDS_AT_ONCE // self.pool.numel()))
+        differing = torch.cat([(self.pool != rows.unsqueeze(1)).sum(-1) for rows in some])
+        differing = torch.where(differing == 0, self.pool.shape[1] + 1, differing)
+        return differing.topk(min(NEAREST, len(self.pool) - 1), largest=False).indices
 
     def watch(self, own: Tensor, other: Tensor) -> None:
         """Learn the share of suitable ones from scores of positives [N] and random others [*, K].
