@@ -193,10 +193,10 @@ class NegativeInstructions(nn.Module):
         share, over = self.share, self.progress >= self.warmup
         if self.training and over and self.estimate is not None and self.undecided:
             self.bound.fill_(share)
-        mask = torch.ones_like(scores, dtype=torch.bool)
+        mask = torch.ones(scores.numel(), dtype=torch.bool, device=scores.device)
         if drop := int(share * scores.numel()):
-            mask.view(-1)[scores.detach().flatten().topk(drop).indices] = False
-        return mask
+            mask[scores.detach().flatten().topk(drop).indices] = False
+        return mask.reshape(scores.shape)
 
     def randint(self, low: int, high: int, shape: tuple[int, ...]) -> Tensor:
         """Draw integers from ``low`` up to ``high``, which is left out."""
