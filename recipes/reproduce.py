@@ -4,6 +4,7 @@ python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 """
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from ifo_grounding.data import babyai
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home, read_json
 from ifo_grounding.tasks import TASKS
+from ifo_grounding.training import Run
 
 GOAL = "goal-pairs-5000"
 """Phase 2 paid for the goal, of the preset whose own phase 2 is paid for actions."""
@@ -85,8 +87,17 @@ class Piece:
         """
         return changes(read_json(self.file)["options"], self.arguments)
 
+    def of_another_phase_1(self) -> bool:
+        """Return whether its run began with a phase 1 that its base has made anew since."""
+        if self.base is None:
+            return False
+        made = [Run(name).record("imitate").get("settings") for name in (self.run, self.base)]
+        return None not in made and made[0] != made[1]
+
     def make(self) -> int:
         """Make it in a process of its own, at one thread; what it prints goes to a file."""
+        if self.of_another_phase_1():
+            shutil.rmtree(self.folder)  # begun as it is, it would imitate by itself once more
         self.log.parent.mkdir(parents=True, exist_ok=True)
         command = [sys.executable, str(Path(__file__).with_name("study.py")), *self.arguments]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -87,6 +87,13 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
         options("figure=6", "tasks=[move]", "presets=[strong]", "device=cuda")
     )
     assert elsewhere.done and elsewhere.arguments[-1] == "device=cuda"
+    # What was begun with another phase 1 begins anew, and does not imitate by itself.
+    longer = "+options_of.preset.strong.imitate.batch_size=32"
+    anew = options("figure=6", "tasks=[move]", "presets=[strong]", longer)
+    assert reproduce(anew) == []
+    assert "imitate: running" in first.log.read_text()
+    assert "imitate: done before" in second.log.read_text()
+    assert "self_examine: running" in second.log.read_text()
 
 
 def test_a_preset_may_have_options_of_one_task_alone(options):
