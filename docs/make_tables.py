@@ -5,6 +5,7 @@ Reads ``results/tables/*.json``, the pieces of the recipe `reproduce`, and write
 date.
 """
 
+import math
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -117,9 +118,17 @@ def mean(shares: list[float], digits: int = 2) -> str:
     return f"{100 * sum(shares) / len(shares):.{digits}f}%"
 
 
-def of_paper(percent: float) -> str:
+def of_paper(percent: float) -> Rate:
     """Return a rate of the paper with the interval that its number of episodes implies."""
-    return brief(wilson(round(percent / 100 * EPISODES), EPISODES))
+    return wilson(round(percent / 100 * EPISODES), EPISODES)
+
+
+def gain_of_paper(before: Rate, after: Rate) -> str:
+    """Return the difference of two rates of different episodes (Newcombe 1998, his method 10)."""
+    gain = after.rate - before.rate
+    low = gain - math.hypot(after.rate - after.low, before.high - before.rate)
+    high = gain + math.hypot(after.high - after.rate, before.rate - before.low)
+    return f"{100 * gain:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}] points"
 
 
 def named(preset: str, phase: str) -> str:
@@ -143,9 +152,10 @@ def success_rows(
     ran = {preset for _, preset, phase in found if phase in phases}
     presets = [preset for preset in PRESETS if preset in ran]
     for task in TASKS:
-        told = [of_paper(percent) for percent in reported[task]]
+        first, *later = map(of_paper, reported[task])
+        told = [f"{brief(rate)}<br>{gain_of_paper(first, rate)}" for rate in later]
         rows.append({"task": f"**{task}**", "by": "the paper", "seeds": ""})
-        rows[-1] |= dict(zip(heads, told, strict=True))
+        rows[-1] |= dict(zip(heads, [brief(first), *told], strict=True))
         for preset in presets:
             runs = [found.get((task, preset, phase)) for phase in phases]
             shown = ["phase1", *["phase2"] * (len(phases) - 1)]

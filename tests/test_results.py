@@ -135,6 +135,11 @@ def test_levels_of_babyai_are_compared_with_their_references(tmp_path, monkeypat
     assert "ifo-grounding run study world=babyai" in "\n".join(lines)
 
 
+def test_gains_of_the_paper_have_newcombes_interval():
+    gain = load_script("make_tables").gain_of_paper(wilson(48, 80), wilson(56, 70))
+    assert gain == "+20.0 [+5.2, +33.4] points"  # 0.0524 and 0.3339 in his table II, method 10
+
+
 def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
     script = load_script("make_tables")
     folder = tmp_path / "results" / "tables"
