@@ -43,6 +43,7 @@ PARTS = (
     "imitate.held_out",
     "instruction.near",
     "instruction.removal_rate",
+    "goal.near",
     "goal.removal_rate",
 )
 """Shares that are never the whole."""

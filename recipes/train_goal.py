@@ -13,7 +13,9 @@ from ifo_grounding.objectives import GoalLoss
 
 def train_goal(options: DictConfig) -> dict:
     needs = ["record_demonstrations", *(["imitate"] if options.goal.init_from_policy else [])]
-    stage = open_stage(options, "train_goal", ["goal"], needs)
+    # Runs without near negatives go on as they were before there were any.
+    without = () if options.goal.near else ("goal.near",)
+    stage = open_stage(options, "train_goal", ["goal"], needs, without=without)
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
@@ -24,6 +26,7 @@ def train_goal(options: DictConfig) -> dict:
         demos.pool(),
         negatives=options.goal.negatives,
         removal_rate=options.goal.removal_rate,
+        near=options.goal.near,
     )
     return train(options, stage, loss, goal_buffer(demos), "goal", GOAL)
 

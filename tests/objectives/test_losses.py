@@ -508,6 +508,15 @@ def test_the_share_of_suitable_pairs_comes_from_random_ones_alone(fresh):
     assert seen == [2 + fresh]  # two of the three others, and itself in fresh states
 
 
+def test_near_negatives_of_final_frames_say_nothing_of_the_share():
+    loss = make_loss("goal", negatives=4, near=0.5, removal_rate="estimated")
+    seen = []
+    loss.negatives.estimate.add = lambda own, other: seen.append((len(own), other.shape[-1]))
+    data = batch()
+    loss(data)
+    assert seen == [(int(data["final"].sum()), 2)]
+
+
 def some_steps(action="action"):
     return TensorDict(
         {

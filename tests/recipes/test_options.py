@@ -264,3 +264,19 @@ def test_how_instructions_are_chosen_decides_nothing_of_what_chooses(compose):
     practice = ["self_examine", "instruction"]
     open_stage(compose("two_phase"), "self_examine", practice, []).finish({})
     assert open_stage(options, "self_examine", practice, []).result is None
+
+
+def test_a_goal_judge_from_before_there_were_near_negatives_is_one_without_any(compose):
+    from _shared import open_run, plain
+    from train_goal import train_goal
+
+    options = compose("two_phase", "goal.init_from_policy=false")
+    section = plain(options.goal)
+    del section["near"]
+    earlier = {key: plain(options[key]) for key in ("task", "seed", "network", "world")}
+    open_run(options).stage("record_demonstrations", {}).finish({})
+    stage = open_run(options).stage(
+        "train_goal", {**earlier, "goal": section}, ["record_demonstrations"]
+    )
+    stage.finish({"loss_goal": 0.5})
+    assert train_goal(options) == {"loss_goal": 0.5}

@@ -421,6 +421,7 @@ def test_practice_on_stale_judges_is_refused_and_said_to_be_left_out(compose, tm
         ("self_examine.reward_lr=0.0", "self_examine.reward_lr must be above 0"),
         ("instruction.unlabelled=foo", "unknown instruction.unlabelled 'foo'"),
         ("instruction.near=1.0", r"instruction.near must be a share, in \[0, 1\)"),
+        ("goal.near=-0.5", r"goal.near must be a share, in \[0, 1\)"),
         ("goal.removal_rate=few", r"goal.removal_rate must be a share, in \[0, 1\), got few"),
         ("networks.dropout=2.0", "dropout must lie in"),
         ("world.layout.objects=[1]", r"objects must be \(fewest, most\)"),

@@ -35,6 +35,7 @@ class GoalLoss(SupervisedLoss):
         removal_rate: share of a batch's other instructions to remove, those scored highest, or
             ``"estimated"``.
         warmup: share of training before which none is removed; see :meth:`set_progress`.
+        near: share of the other instructions that differ from the own one in few words.
         generator: where random numbers come from; None is the global generator.
 
     Raises:
@@ -75,12 +76,13 @@ class GoalLoss(SupervisedLoss):
         negatives: int = 8,
         removal_rate: float | str = 0.0,
         warmup: float = 1 / 3,
+        near: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
         negatives = at_least_one("negatives", negatives)
         self.count = negatives
-        self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator)
+        self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator, near)
 
     def set_progress(self, fraction: float) -> None:
         """Say which share of training is done, in [0, 1]; until told, training counts as late."""
@@ -114,7 +116,7 @@ class GoalLoss(SupervisedLoss):
                     torch.ones_like(each, dtype=torch.bool) for each in (own, early, other)
                 )
         if self.training:
-            self.negatives.watch(own, other)
+            self.negatives.watch(own, other[:, : self.negatives.uniform(self.count)])
         kept = told & self.negatives.keep(other)
         finished = masked_mean(F.softplus(-own), last)
         unfinished = masked_mean(F.softplus(early), before)
