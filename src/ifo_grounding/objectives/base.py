@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.modules import hidden_from_python
+from ifo_grounding.modules import charges, hidden_from_python
 
 
 @contextlib.contextmanager
@@ -71,6 +71,11 @@ class SupervisedLoss(LossModule):
     def capturable(self) -> bool:
         """Whether all steps do the same, so that a GPU may be told of them once (a CUDA graph)."""
         return False
+
+    def _steps_alike(self) -> bool:
+        """Whether no words are charged for, and no numbers drawn from a generator of its own."""
+        parts = [getattr(part, "generator", None) for part in self.modules()]
+        return not charges(self.network) and all(part is None for part in parts)
 
     def _own_keys(self) -> list[NestedKey]:
         """Return the keys that are read because the network reads them."""

@@ -13,7 +13,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding.errors import at_least_one
-from ifo_grounding.modules import charges
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
@@ -91,8 +90,7 @@ class GoalLoss(SupervisedLoss):
     @property
     def capturable(self) -> bool:
         """Whether all steps do the same: how many negatives to drop would have to be counted."""
-        same = self.negatives.keeps_all and self.negatives.generator is None
-        return same and not charges(self.network)
+        return self.negatives.keeps_all and self._steps_alike()
 
     def _extra_keys(self) -> list[NestedKey]:
         return [self.tensor_keys.final]

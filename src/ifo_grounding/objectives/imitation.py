@@ -80,7 +80,7 @@ class ImitationLoss(SupervisedLoss):
     @property
     def capturable(self) -> bool:
         """Whether all steps do the same: where words are charged for, they are looked at."""
-        return not charges(self.network)
+        return self._steps_alike()
 
     @property
     def out_keys(self) -> list[NestedKey]:

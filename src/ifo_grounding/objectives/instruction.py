@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.modules import charges, set_lenient
+from ifo_grounding.modules import set_lenient
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import (
     ESTIMATED,
@@ -163,8 +163,8 @@ class InstructionLoss(SupervisedLoss):
     @property
     def capturable(self) -> bool:
         """Whether all steps do the same: how many negatives to drop would have to be counted."""
-        same = self.unlabelled == "mixture" or self.negatives.keeps_all
-        return same and self.negatives.generator is None and not charges(self.network)
+        keeps_all = self.unlabelled == "mixture" or self.negatives.keeps_all
+        return keeps_all and self._steps_alike()
 
     def _extra_keys(self) -> list[NestedKey]:
         return []

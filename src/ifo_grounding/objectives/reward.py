@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import charges
 from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
 
 
@@ -72,7 +71,7 @@ class RewardLoss(SupervisedLoss):
     @property
     def capturable(self) -> bool:
         """Whether all steps do the same: where words are charged for, they are looked at."""
-        return self.generator is None and not charges(self.network)
+        return self._steps_alike()
 
     def _own_keys(self) -> list[NestedKey]:
         """The network's inputs but for the action, which is the labelled one or another."""
