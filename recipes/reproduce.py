@@ -41,6 +41,11 @@ WANTED = {
 """Pieces that each table and figure of the paper is made from; the first has phase 1."""
 
 
+def first_of(phase: str) -> str:
+    """Return the phase whose run a phase begins with; itself, where it has a phase 1 of its own."""
+    return next(of[0] for of in (PHASES, ZERO_SHOT, (UNSEEN,)) if phase in of)
+
+
 @dataclass(frozen=True)
 class Piece:
     """One call of the recipe `study` that leaves one small file of results."""
@@ -131,6 +136,8 @@ def pieces(options: DictConfig) -> list[list[Piece]]:
         )
     for task in options.tasks:
         check_choice("task", task, TASKS)
+    if options.phases is not None and not asked & {"table", "figure"}:
+        raise UserError("phases are of a table or a figure: name one, or leave phases out")
     if options.jobs < 1:
         raise UserError(f"jobs must be at least 1, got {options.jobs}")
     found = table_chains(options) if asked & {"table", "figure"} else []
@@ -222,11 +229,18 @@ def leveled(options: DictConfig, level: str, n: int, seed: int) -> Piece:
 
 
 def wanted_phases(options: DictConfig) -> list[str]:
-    """Return the phases that the tables and figures asked for need, in order."""
+    """Return the phases that the tables and figures asked for need, in order.
+
+    Where ``phases`` names some of them, these alone, with what they begin with.
+    """
     asked = [(kind, options[kind]) for kind in ("table", "figure") if options[kind] is not None]
     for kind, number in asked:
         check_choice(kind, number, [of for which, of in WANTED if which == kind])
     needed = {phase for key in asked for phase in WANTED[key]}
+    if options.phases is not None:
+        for phase in options.phases:
+            check_choice("phase", phase, sorted(needed))
+        needed = {*options.phases, *map(first_of, options.phases)}
     return [phase for phase in (*PHASES, *ZERO_SHOT, UNSEEN) if phase in needed]
 
 
@@ -238,7 +252,7 @@ def chain(
     for phase in phases:
         if phase == GOAL and preset != "paper":
             continue  # paid for the goal as it is
-        first = next(of[0] for of in (PHASES, ZERO_SHOT, (UNSEEN,)) if phase in of)
+        first = first_of(phase)
         names = {part: f"tables-{task}-{preset}-{part}-seed{seed}" for part in (phase, first)}
         given = {
             "task": task,

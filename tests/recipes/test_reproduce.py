@@ -199,6 +199,23 @@ def test_listing_runs_nothing(options, capsys):
     assert all(line.startswith("not run") for line in lines)
 
 
+def test_phases_are_made_with_what_they_begin_with(options):
+    from reproduce import pieces
+
+    def runs(*given):
+        (chain,) = pieces(options("tasks=[move]", "presets=[strong]", *given))
+        return [piece.run.removeprefix("tables-move-strong-") for piece in chain]
+
+    assert runs("table=2", "phases=[pairs-10000]") == ["phase-1-seed0", "pairs-10000-seed0"]
+    assert runs("table=4", "phases=[zero-shot]") == ["zero-shot-seed0"]
+    both = "phases=[zero-shot-unseen,zero-shot-pairs-5000]"
+    assert runs("table=4", both) == [
+        "zero-shot-seed0",
+        "zero-shot-pairs-5000-seed0",
+        "zero-shot-unseen-seed0",
+    ]
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -207,6 +224,8 @@ def test_listing_runs_nothing(options, capsys):
         (["table=2", "tasks=[mvoe]"], "mvoe"),
         (["table=2", "jobs=0"], "jobs must be at least 1"),
         (["table=2", "presets=[huge]"], "huge"),
+        (["table=4", "phases=[phase-1]"], "phase-1"),
+        (["ablation=all", "phases=[phase-1]"], "phases are of a table"),
         (["ablation=gravity"], "gravity"),
         (["ablation=all", "tasks=[pick]"], "move, pick-out alone"),
         (["level=GoToMoon"], "no level 'BabyAI-GoToMoon-v0'"),
