@@ -106,7 +106,8 @@ def open_stage(
     ``without`` names options of these sections, such as ``instruction.choose``, that do not count.
 
     Raises:
-        UserError: where the stages that it needs are of another task or world.
+        UserError: where the stages that it needs are of another task or world, or one that was
+            interrupted builds on what it would make anew.
     """
     release_freed_memory()  # of the stage before
     run = open_run(options)
@@ -123,7 +124,15 @@ def open_stage(
         decisive["networks"] = changed  # only then: runs without any go on as they were
     stage = run.stage(name, decisive, needs)
     if stage.result is None:
+        if (left := run.unfinished_on(name)) is not None:
+            raise UserError(
+                f"{name} would be made anew, for its options or an earlier stage are not what they "
+                f"were, but {left} was interrupted, which builds on it as it is: give this run "
+                f"another name, finish {left} with the options that it was begun with, or delete "
+                f"{run / 'checkpoints' / left}*.pt to give it up"
+            )
         keep_machine(stage, options.device)
+        stage.begin()
         if name not in OF_LOOKS:
             keep_options(run, options, ["simulator", *common, "networks", *sections])
     if stage.result is not None:

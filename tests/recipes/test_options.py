@@ -230,6 +230,24 @@ def test_a_run_says_where_each_stage_was_done(compose, monkeypatch):
     assert _shared.machines(run) == {**done, "imitate": ["a GPU"]}
 
 
+def test_what_an_interrupted_stage_builds_on_is_not_replaced(compose):
+    import _shared
+    from record_demonstrations import record
+
+    options = compose("two_phase", "demonstrations.n=20")
+    record(options)
+    stage = _shared.open_stage(options, "imitate", ["imitate"], needs=["record_demonstrations"])
+    stage.checkpoint.write_text("begun")
+    options.demonstrations.n = 30
+    before = stage.run.record("record_demonstrations")
+    with pytest.raises(UserError, match="but imitate was interrupted, which builds on it as it is"):
+        record(options)
+    assert stage.run.record("record_demonstrations") == before
+    stage.checkpoint.unlink()
+    record(options)
+    assert stage.run.record("record_demonstrations") != before
+
+
 def test_frames_of_tiles_are_decoded_on_a_gpu(recipes):
     from _learning import decode_on
     from controls import Both

@@ -167,3 +167,20 @@ def test_what_is_being_replaced_is_not_taken_for_done(tmp_path):
     run.stage("count", {"to": 3}).finish({"counted": 3})
     run.stage("count", {"to": 4}).replace()  # and killed before it was done
     assert run.stage("count", {"to": 3}).result is None and not run.is_current("count")
+
+
+def test_an_interrupted_stage_is_known_to_whatever_it_builds_on(tmp_path):
+    run = Run(tmp_path / "run")
+    for name, needs in (("label", []), ("imitate", ["label"]), ("judge", []), ("other", [])):
+        run.stage(name, {}, needs).finish({})
+    practice = run.stage("practise", {}, ["imitate", "judge"])
+    practice.begin()
+    assert run.unfinished_on("imitate") is None  # nothing is left of it
+    Checkpoint(practice.checkpoint.with_stem("practise-0"), "a").save({})
+    for name in ("label", "imitate", "judge"):
+        assert run.unfinished_on(name) == "practise"
+    assert run.unfinished_on("other") is None
+    run.stage("imitate", {}, ["label"]).replace()  # as if by hand: it builds on that no more
+    assert run.unfinished_on("label") is None
+    practice.finish({})
+    assert not list((run / "checkpoints").iterdir())

@@ -77,8 +77,8 @@ class Run:
     @property
     def begun(self) -> bool:
         """Whether any stage of it was done, or has left a checkpoint."""
-        left = (self.folder / name for name in ("stages", "checkpoints"))
-        return any(folder.is_dir() and any(folder.iterdir()) for folder in left)
+        left = ("stages/*.json", "checkpoints/*.pt")
+        return any(any(self.folder.glob(kind)) for kind in left)
 
     def take_over(self, other: Run, without: Sequence[str] = ()) -> None:
         """Copy what another run has made, unless this one has begun.
@@ -126,6 +126,23 @@ class Run:
         path = self._record_path(name)
         return read_json(path) if path.exists() else {}
 
+    def unfinished_on(self, name: str) -> str | None:
+        """Return an interrupted stage that builds on another as that is now, None without any."""
+        for begun in sorted((self.folder / "checkpoints").glob("*.json")):
+            left = _checkpoints(begun.with_suffix(".pt"))
+            if left and self._builds_on(read_json(begun), name):
+                return begun.stem
+        return None
+
+    def _builds_on(self, record: dict[str, Any], name: str) -> bool:
+        """Whether a stage, of this record, was made from what another is now."""
+        needs = record.get("needs", {})
+        return any(
+            settings == self.record(need).get("settings") is not None
+            and (need == name or self._builds_on(self.record(need), name))
+            for need, settings in needs.items()
+        )
+
     def _record_path(self, name: str) -> Path:
         return self.folder / "stages" / f"{name}.json"
 
@@ -149,17 +166,13 @@ class Stage:
         if record.get("settings") == settings:
             self.result = record["result"]
         self.checkpoint = run.folder / "checkpoints" / f"{name}.pt"
-        left = [path for path in self.checkpoints() if path.exists()]
+        left = _checkpoints(self.checkpoint)
         self.continues = bool(left)
         self._start = time.monotonic() - (sum(map(spent, left)) if self.result is None else 0.0)
 
-    def checkpoints(self) -> list[Path]:
-        """Return the checkpoint and those beside it, named after it with a dash and a number."""
-        folder, stem = self.checkpoint.parent, self.checkpoint.stem
-        beside = (
-            path for path in folder.glob(f"{stem}-*.pt") if path.stem[len(stem) + 1 :].isdigit()
-        )
-        return [self.checkpoint, *sorted(beside)]
+    def begin(self) -> None:
+        """Note beside its checkpoint what the stage builds on, for as long as it is not done."""
+        write_json(self.checkpoint.with_suffix(".json"), {"needs": self.needs})
 
     def replace(self) -> None:
         """Forget that the stage is done: what was made with other settings is written over now."""
@@ -175,7 +188,7 @@ class Stage:
         made_of = {"settings": self.settings, "needs": self.needs}
         record = {**made_of, "result": result, "seconds": seconds}
         write_json(self.run._record_path(self.name), record)
-        for path in self.checkpoints():
+        for path in (*_checkpoints(self.checkpoint), self.checkpoint.with_suffix(".json")):
             path.unlink(missing_ok=True)
         self.result = result
         return result
@@ -211,6 +224,16 @@ class Stage:
                     logger.log_scalar(f"{self.name}/{key}", value, step=step)
 
         return log
+
+
+def _checkpoints(path: Path) -> list[Path]:
+    """Return a checkpoint, if it is there, and those named after it with a dash and a number."""
+    beside = (
+        other
+        for other in path.parent.glob(f"{path.stem}-*.pt")
+        if other.stem[len(path.stem) + 1 :].isdigit()
+    )
+    return [*([path] if path.exists() else []), *sorted(beside)]
 
 
 def _last_step(folder: Path) -> int:
