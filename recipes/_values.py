@@ -1,5 +1,6 @@
 """Values that no stage could use, refused before the first one begins."""
 
+import math
 from typing import Any
 
 import torch
@@ -68,7 +69,7 @@ def check_values(options: DictConfig) -> None:
                 continue
             if names is AT_LEAST_ONE:
                 whole(name, number)
-            if isinstance(number, str) or not fits(number):
+            if isinstance(number, str) or not fits(number) or math.isinf(number):
                 raise UserError(f"{name} must be {allowed}, got {number}")
     check_device(options.device)
 

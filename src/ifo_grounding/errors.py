@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
 import operator
 from collections.abc import Iterable, Iterator
 from dataclasses import fields
@@ -56,10 +57,11 @@ def at_least_one(name: str, value: object) -> int:
     return number
 
 
-def check_numbers(config: Any) -> None:
+def check_numbers(config: Any, unbounded: Iterable[str] = ()) -> None:
     """Refuse values of a dataclass that are no numbers where its fields say ``int`` or ``float``.
 
-    Those of NumPy and PyTorch become Python's, which a checkpoint can hold.
+    Those of NumPy and PyTorch become Python's, which a checkpoint can hold. Only what is named
+    ``unbounded`` may be infinite.
 
     Raises:
         UserError: with the name of the first of them.
@@ -75,6 +77,8 @@ def check_numbers(config: Any) -> None:
             isinstance(value, bool | str) or not isinstance(value, SupportsFloat) or value != value
         ):
             raise UserError(f"{field.name} must be a number, got {value!r}")
+        elif field.type == "float" and math.isinf(value) and field.name not in unbounded:
+            raise UserError(f"{field.name} must be finite")
 
 
 def did_you_mean(given: str, allowed: Iterable[str]) -> str:

@@ -6,8 +6,13 @@ import contextlib
 from collections.abc import Iterator
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.keys import ACTION_SCORE, GOAL_SCORE, SUITABILITY
 
 
 @contextlib.contextmanager
@@ -45,6 +50,37 @@ def device_of(module: object) -> torch.device | None:
         for tensor in (*module.parameters(), *module.buffers()):
             return tensor.device
     return None
+
+
+def output_key(module: TensorDictModuleBase, *expected: str) -> NestedKey:
+    """Key under which a TensorDictModule writes what is asked of it.
+
+    It is the one that is named as expected, wherever it is nested, or the only one.
+
+    Raises:
+        UserError: where ``module`` is no TensorDictModule, it is unclear which output is meant, or
+            it is what another judge says.
+
+    >>> from tensordict.nn import TensorDictModule
+    >>> output_key(TensorDictModule(nn.Identity(), ["x"], ["features", "logits"]), "logits")
+    'logits'
+    """
+    named = " or ".join(map(repr, expected))
+    if not isinstance(module, TensorDictModuleBase):
+        raise UserError(
+            f"expected a TensorDictModule that writes {named}, got {type(module).__name__}"
+        )
+    names = [unravel_key(key) for key in module.out_keys]
+    for name in names:
+        if name in expected or (isinstance(name, tuple) and name[-1] in expected):
+            return name
+    if len(names) != 1:
+        raise UserError(f"the module writes {names}: one of them must be named {named}")
+    if (written := names[0]) in (ACTION_SCORE, GOAL_SCORE, SUITABILITY):
+        raise UserError(
+            f"the module writes {written!r}: what is needed here is a judge that says {named}"
+        )
+    return written
 
 
 def beside(batch: TensorDictBase, module: object) -> TensorDictBase:

@@ -7,6 +7,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage
+from torchrl.envs import ToTensorImage
 
 from ifo_grounding.data import (
     Demonstrations,
@@ -74,6 +76,33 @@ def test_labels_read_from_tiles_are_those_read_from_pixels(task, preset, monkeyp
     assert len(report.actions.unique()) > 1
     assert torch.equal(report.actions, plain.actions)
     torch.testing.assert_close(report.confidence, plain.confidence)
+
+
+@pytest.mark.parametrize("preset", ["strong", "paper"])
+def test_a_model_reads_the_images_that_it_names(preset):
+    demos = record_demonstrations("move", 20)
+
+    def labels(**names):
+        model = make_inverse(demos, preset, seed=0, **names)
+        return label_demonstrations(demos, model, progress=False), model
+
+    (_, usual), _ = labels()
+    (_, renamed), _ = labels(in_keys=["before", "after"])
+    assert torch.equal(renamed.actions, usual.actions)
+    (buffer, swapped), model = labels(in_keys=[("next", "pixels"), "pixels"])
+    buffer = labelled_buffer(demos, swapped.actions, next_pixels=True)
+    with torch.no_grad():
+        said = model.eval()(buffer[:])["logits"].argmax(-1)
+    assert torch.equal(said, swapped.actions.long())
+
+
+def test_a_buffer_takes_a_transform_and_no_storage():
+    demos = record_demonstrations("move", 20)
+    actions = torch.zeros(demos.transitions, dtype=torch.uint8)
+    scaled = labelled_buffer(demos, actions, transform=ToTensorImage(in_keys=["pixels"]))
+    assert scaled.sample(3)["pixels"].dtype == torch.float32
+    with pytest.raises(UserError, match="leave storage out"):
+        labelled_buffer(demos, actions, storage=LazyTensorStorage(100))
 
 
 @pytest.mark.parametrize(("preset", "tile_size"), [("paper", 8), ("strong", 16), ("strong", None)])

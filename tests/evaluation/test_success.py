@@ -24,9 +24,9 @@ from torchrl.envs.utils import ExplorationType, RandomPolicy, exploration_type
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import compare_success, success_rate
-from ifo_grounding.networks import make_policy
-from ifo_grounding.tasks import TASKS
-from ifo_grounding.transforms import LearnedReward
+from ifo_grounding.networks import make_instruction_classifier, make_policy
+from ifo_grounding.tasks import TASKS, grammar
+from ifo_grounding.transforms import InstructionSampler, LearnedReward
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -208,6 +208,13 @@ def test_environments_of_other_batch_shapes():
     assert len(seen) == 12
 
 
+def practised():
+    """An environment that instructions are chosen for."""
+    classifier = make_instruction_classifier(PickAndPlaceEnv(), seed=0)
+    sampler = InstructionSampler(classifier, grammar("move").tokens)
+    return TransformedEnv(PickAndPlaceEnv(num_envs=2, instructed=False), sampler)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -216,6 +223,7 @@ def test_environments_of_other_batch_shapes():
         (lambda p: success_rate(p, "move", stream="test"), "unknown stream 'test'"),
         (lambda p: success_rate(p, "move", episodes=0), "must be at least 1"),
         (lambda p: success_rate(p, PickAndPlaceEnv(instructed=False)), "instructed"),
+        (lambda p: success_rate(p, practised()), "pays no true reward"),
         (lambda p: success_rate(p, PickAndPlaceEnv(), tile_size=8), "tile_size"),
     ],
 )

@@ -1,8 +1,10 @@
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
-from ifo_grounding.networks import ConvEncoder, PatchEncoder
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import ConvEncoder, PatchEncoder, Shapes, make_policy
 from ifo_grounding.networks.patches import distinct_blocks, distinct_windows
 
 
@@ -118,3 +120,18 @@ def test_one_patch_sees_one_cell():
     changed[..., 8:16, 24:32] = 255
     different = (encoder(pixels) != encoder(changed)).any(1)[0]
     assert different.nonzero().tolist() == [[1, 3]]
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.int16, torch.bool])
+def test_whole_numbers_that_are_no_bytes_are_no_images(dtype):
+    policy = make_policy(Shapes((3, 48, 48), vocabulary_size=9), "paper", seed=0)
+    with pytest.raises(UserError, match=r"bytes \(uint8\) or floats within 0..1"):
+        policy(
+            TensorDict(
+                {
+                    "pixels": torch.zeros(2, 3, 48, 48, dtype=dtype),
+                    "instruction": torch.ones(2, 16, dtype=torch.int64),
+                },
+                [2],
+            )
+        )

@@ -243,3 +243,15 @@ def test_several_policies_run_side_by_side(shapes):
     found = torch.vmap(run, randomness="different")(parameters, buffers)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
     assert policies[0](batch.copy())["logits"].shape == (1, 6)  # nothing was left behind
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_it_learns_in_another_precision(dtype):
+    demos, truth = record_demonstrations("move", 20, keep_truth=True)
+    policy = make_policy(demos, seed=0).to(dtype)
+    batch = labelled_buffer(demos, truth.actions).sample(16)
+    losses = ImitationLoss(policy)(batch)
+    losses["loss_imitation"].backward()
+    assert all(
+        weight.grad.isfinite().all() for weight in policy.parameters() if weight.grad is not None
+    )

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.distributions import Categorical
 from torchrl.modules import OneHotCategorical, ProbabilisticActor
@@ -104,10 +104,10 @@ class Suitability(nn.Module):
         return self.table[instruction[..., :1]]
 
 
-def suitability(probabilities) -> TensorDictModule:
+def suitability(probabilities, written="suitability") -> TensorDictModule:
     table = torch.tensor([0.0, *map(logit, probabilities)])
     return TensorDictModule(
-        Suitability(table), in_keys=["pixels", "instruction"], out_keys=["suitability"]
+        Suitability(table), in_keys=["pixels", "instruction"], out_keys=[written]
     )
 
 
@@ -364,7 +364,7 @@ def test_goal_loss_by_hand():
         },
         [3],
     )
-    out = GoalLoss(suitability([0.9, 0.6]), pool, removal_rate=0.0)(data)
+    out = GoalLoss(suitability([0.9, 0.6], "goal_score"), pool, removal_rate=0.0)(data)
     finished, elsewhere = -math.log(0.9), -math.log(0.4)
     unfinished = -(math.log(0.1) + math.log(0.4)) / 2
     expected = (finished + (unfinished + elsewhere) / 2) / 2
@@ -567,3 +567,58 @@ def test_imitation_can_be_mapped_over_batches():
 
     found = torch.vmap(one)(*(steps[key] for key in loss.in_keys))
     torch.testing.assert_close(found, torch.stack([loss(row)["loss_imitation"] for row in steps]))
+
+
+class Both(nn.Module):
+    """Features of images, of any other inputs too."""
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        return torch.stack([each.float().reshape(len(each), -1).mean(1) for each in inputs], -1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "reads", "written", "count"),
+    [
+        (InverseLoss, ["pixels", ("next", "pixels")], "logits", 3),
+        (partial(InstructionLoss, pool=POOL), ["pixels", "instruction"], "suitability", 1),
+        (partial(RewardLoss, n_actions=3), ["pixels", "instruction", "action"], "action_score", 1),
+        (partial(GoalLoss, pool=POOL), ["pixels", "instruction"], "goal_score", 1),
+    ],
+)
+def test_the_output_learns_that_is_named_as_asked(kind, reads, written, count):
+    data = TensorDict(
+        {
+            "pixels": torch.rand(8, 3, 4, 4),
+            "next": {"pixels": torch.rand(8, 3, 4, 4)},
+            "instruction": POOL[torch.arange(8) % len(POOL)],
+            "action": torch.arange(8) % 3,
+            "final": (torch.arange(8) % 2 == 0).unsqueeze(-1),
+        },
+        [8],
+    )
+    head = nn.Linear(len(reads), count)
+    network = TensorDictSequential(
+        TensorDictModule(Both(), reads, ["features"]),
+        TensorDictModule(head, ["features"], [written]),
+    )
+    losses = kind(network)(data)
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    assert head.weight.grad.abs().sum() > 0
+    head_of_another_name = TensorDictModule(head, ["features"], ["answer"])
+    with pytest.raises(UserError, match=f"one of them must be named '{written}'"):
+        kind(TensorDictSequential(network[0], head_of_another_name))
+
+
+def test_actions_are_whole_and_as_many_as_is_said():
+    network = TensorDictModule(Both(), ["pixels", "action"], ["action_score"])
+    with pytest.raises(UserError, match="give n_actions="):
+        RewardLoss(network)
+    data = batch((4,)).set("action", torch.full((4,), 0.5))
+    for name in ("imitation", "inverse", "reward"):
+        with pytest.raises(UserError, match="whole numbers"):
+            make_loss(name)(data)
+
+
+def test_a_pool_is_made_of_tokens():
+    with pytest.raises(UserError, match=r"such as demos.pool\(\), got NoneType"):
+        InstructionLoss(suitability([0.5]), None)

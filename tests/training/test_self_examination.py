@@ -5,8 +5,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torch import nn
+from torch.distributions import Categorical
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, GymEnv, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives.value import GAE
 
 from ifo_grounding import keys
@@ -158,6 +161,28 @@ def test_divergence_from_phase_1_costs_reward():
         for kl in (0.0, 10.0)
     ]
     assert held < free - 0.1
+
+
+def test_a_policy_that_reads_more_may_be_held_too():
+    class Counting(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.bias = nn.Parameter(torch.zeros(keys.N_ACTIONS))
+
+        def forward(self, pixels, instruction, count):
+            return self.bias + 0 * count
+
+    read = [keys.PIXELS, keys.INSTRUCTION, "step_count"]
+    policy = ProbabilisticActor(
+        TensorDictModule(Counting(), read, ["logits"]),
+        in_keys=["logits"],
+        distribution_class=Categorical,
+        return_log_prob=True,
+    )
+    env = make_env(likes(1))
+    env.append_transform(StepCounter())
+    history = self_examine(env, policy, make_networks()[1], config(kl=0.1), seed=0)
+    assert history[0]["divergence"] == 0.0
 
 
 def test_the_learned_reward_is_told_without_what_divergence_costs():
@@ -365,6 +390,9 @@ def test_envs_that_leak_or_lack_something_are_refused():
         self_examine(
             TransformedEnv(worlds, LearnedReward(likes(1))), policy, value, config(), seed=0
         )
+    told = SerialEnv(2, lambda: GymEnv("ifo_grounding/Move-v0", categorical_action_encoding=True))
+    with pytest.raises(UserError, match="never sees true instructions"):
+        self_examine(TransformedEnv(told, LearnedReward(likes(1))), policy, value, config(), seed=0)
     with pytest.raises(UserError, match="no instructions"):
         self_examine(simulator(), policy, value, config(), seed=0)
     sampled = TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))

@@ -163,6 +163,7 @@ def test_the_schedule_warms_up_and_ends_near_zero():
         {"warmup": 5.0},
         {"warmup": -0.1},
         {"evaluate_every": -2},
+        {"weight_decay": math.inf},
     ],
 )
 def test_impossible_configs_are_refused(wrong):
@@ -228,3 +229,8 @@ def test_numbers_of_numpy_do_not_break_a_checkpoint(buffer, tmp_path):
     fit(imitation(), buffer, config, until=2, **options)
     history = fit(imitation(), buffer, config, **options)
     assert [row["success"] for row in history] == [0.5, 0.5]
+
+
+def test_a_network_that_diverges_is_not_learned_on(buffer):
+    with pytest.raises(UserError, match="fit diverged: loss_imitation no longer finite by step"):
+        fit(imitation(), buffer, FitConfig(steps=40, iteration=5, batch_size=16, lr=1e30), seed=0)

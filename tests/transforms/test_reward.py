@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -278,6 +280,10 @@ def test_beside_a_reward_sum():
         ({"goal_model": 0}, "goal_model is for kind='both'"),
         ({"kind": "goal", "form": "centred"}, "a goal pays a probability"),
         ({"weights": (1,)}, "weights are two"),
+        ({"weights": (math.nan, 1)}, "weights are two"),
+        ({"weights": ("a", 1)}, "weights are two"),
+        ({"stop_action": -1}, "an action, from 0 on, got -1"),
+        ({"stop_action": True}, "stop_action is the number of an action"),
         ({"stop_action": "last"}, "unknown stop_action 'last'"),
         ({"stop_action": 1.5}, "stop_action is the number of an action"),
         ({"arrival": 0.9}, "of the judge of goals.*kind='action'"),
@@ -288,6 +294,15 @@ def test_beside_a_reward_sum():
 def test_impossible_options(options, message):
     with pytest.raises(UserError, match=message):
         LearnedReward(action_judge(), **options)
+
+
+def test_what_does_not_fit_the_environment_is_refused():
+    with pytest.raises(UserError, match="pays 'reward' already, which stays where it is"):
+        make(LearnedReward(action_judge(), reward_key="reward")).rollout(1)
+    with pytest.raises(UserError, match="stop_action=99 is no action"):
+        make(LearnedReward(goal_judge(), kind="goal", stop_action=99)).rollout(1)
+    with pytest.raises(UserError, match="say which of them is the image after the step"):
+        LearnedReward(goal_judge(), kind="goal", pixels_key="camera")
 
 
 def test_who_knows_the_stop_is_asked():

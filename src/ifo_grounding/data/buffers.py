@@ -15,6 +15,7 @@ from ifo_grounding.data._episodes import refuse_empty
 from ifo_grounding.data._spool import same_rows
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.errors import UserError
 
 FINAL = "final"
 
@@ -86,11 +87,17 @@ def frame_buffer(
         stored: entries [N, ...]: numbers of frames at ``frame_keys``, the number of the episode at
             ``instruction``, and whatever else.
         frame_keys: which entries are frames.
-        options: for ``TensorDictReplayBuffer``.
+        options: for ``TensorDictReplayBuffer``; a ``transform`` comes after frames are decoded.
 
     Raises:
-        UserError: where there is no demonstration, or no entry.
+        UserError: where there is no demonstration, or no entry, or a ``storage`` is given.
     """
+    if "storage" in options:
+        raise UserError(
+            "the storage is the buffer's own, which holds numbers of frames that are looked up "
+            "when they are sampled: leave storage out"
+        )
+    further = options.pop("transform", None)
     refuse_empty(len(demos))
     refuse_empty(len(stored[keys.INSTRUCTION]), "transitions")
     entries = TensorDict(stored, [len(stored[keys.INSTRUCTION])])
@@ -105,4 +112,6 @@ def frame_buffer(
         **options,
     )
     buffer.extend(entries)
+    if further is not None:
+        buffer.append_transform(further)  # it sees what is sampled, decoded
     return buffer

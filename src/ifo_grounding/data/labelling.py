@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import torch
-from tensordict import NestedKey, TensorDict
+from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
@@ -120,7 +120,8 @@ def label_demonstrations(
 
     Args:
         demos: demonstrations.
-        inverse: reads ``pixels`` and ``("next", "pixels")``, writes logits [B, A].
+        inverse: reads ``pixels`` and ``("next", "pixels")``, or two images of other names: the one
+            below ``next``, else the second, is the later one. Writes logits [B, A].
         batch_size: transitions at once.
         device: where to run; by default where the model is.
         progress: whether to show a bar.
@@ -221,18 +222,25 @@ def _logits(
     logits_key: NestedKey,
 ) -> Tensor:
     reads_tiles = getattr(getattr(inverse, "module", None), "reads_tiles", None)
-    if reads_tiles is not None and reads_tiles(demos.image_shape, demos.tile_size):
+    present, later, in_order = _image_keys(inverse)
+    if in_order and reads_tiles is not None and reads_tiles(demos.image_shape, demos.tile_size):
         parts = (demos.codec.tiles, demos.codes[frame], demos.codes[frame + 1])
         return inverse.module.from_tiles(*(cast(Tensor, part).to(device) for part in parts))
-    pair = TensorDict(
-        {
-            keys.PIXELS: demos.frames(frame).to(device),
-            keys.NEXT: {keys.PIXELS: demos.frames(frame + 1).to(device)},
-        },
-        [len(frame)],
-    )
+    pair = TensorDict({}, [len(frame)])
+    pair[present], pair[later] = (demos.frames(each).to(device) for each in (frame, frame + 1))
     logits = inverse(pair).get(logits_key, None)
     if logits is None or logits.ndim != 2 or len(logits) != len(frame):
         found = "nothing" if logits is None else list(logits.shape)
         raise UserError(f"the inverse model wrote {found} at {logits_key!r}, not logits [B, A]")
     return logits
+
+
+def _image_keys(inverse: TensorDictModuleBase) -> tuple[NestedKey, NestedKey, bool]:
+    """Return under which keys a model reads a frame and the next one, and if in this order."""
+    read = [unravel_key(key) for key in getattr(inverse, "in_keys", ())]
+    if len(read) != 2:
+        return keys.PIXELS, (keys.NEXT, keys.PIXELS), True
+    later = [isinstance(key, tuple) and key[0] == keys.NEXT for key in read]
+    swapped = later == [True, False]
+    present, following = reversed(read) if swapped else read
+    return present, following, not swapped

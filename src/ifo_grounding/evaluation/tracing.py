@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from ifo_grounding import keys
 from ifo_grounding.evaluation.episodes import device_of
 from ifo_grounding.evaluation.recording import Episode
-from ifo_grounding.modules import evaluating
+from ifo_grounding.modules import evaluating, output_key
 from ifo_grounding.networks.attention import attention_maps
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 
@@ -77,6 +77,7 @@ def trace_episode(
     rewards = {}
     for name, judge in (judges or {}).items():
         with evaluating(judge):
-            logit = judge(seen.select(*judge.in_keys))[judge.out_keys[0]]
+            written = output_key(judge, keys.ACTION_SCORE, keys.GOAL_SCORE)
+            logit = judge(seen.select(*judge.in_keys))[written]
         rewards[name] = logit.sigmoid().flatten().cpu().numpy()
     return Trace(episode, probabilities.cpu().numpy(), maps.cpu().numpy(), rewards)

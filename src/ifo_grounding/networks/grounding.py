@@ -129,7 +129,7 @@ class WordMaps(nn.Module):
         spoken = weights.new_zeros(len(tokens), len(usual), weights.shape[-1])
         spoken = spoken.scatter_add(1, tokens.unsqueeze(-1).expand_as(weights), weights)
         if self.training and len(tokens) and not hidden_from_python(tokens):
-            usual = usual.lerp(spoken.detach().float().mean(0), self.pace)
+            usual = usual.lerp(spoken.detach().float().mean(0).to(usual.dtype), self.pace)
             self.usual[slice(None) if used is None else used] = usual
         return spoken - usual.to(spoken.dtype), manner
 

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.errors import UserError
 from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
 from ifo_grounding.mosaic import as_words
@@ -63,9 +64,17 @@ def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
     """Return pixels in the precision of the weights that read them.
 
     Bytes are scaled to [0, 1]; floating-point pixels are taken as scaled already.
+
+    Raises:
+        UserError: for other whole numbers, which may be scaled or not.
     """
     if pixels.dtype == torch.uint8:
         return pixels.to(weight.dtype).mul_(1 / 255)
+    if not pixels.is_floating_point():
+        raise UserError(
+            f"images are bytes (uint8) or floats within 0..1, got {pixels.dtype}: convert them "
+            "with pixels.to(torch.uint8)"
+        )
     return pixels.to(weight.dtype)
 
 

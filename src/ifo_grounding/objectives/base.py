@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.modules import charges, hidden_from_python
+from ifo_grounding.modules import charges, hidden_from_python, output_key
 
 
 @contextlib.contextmanager
@@ -47,6 +47,9 @@ class SupervisedLoss(LossModule):
         network: the network to train.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the losses of the samples. Metrics are
             always means.
+
+    Raises:
+        UserError: where it is unclear which output of the network is to learn.
     """
 
     @dataclass
@@ -55,12 +58,15 @@ class SupervisedLoss(LossModule):
 
     default_keys: Any = _AcceptedKeys
     tensor_keys: Any
+    written: str | None = None
+    """How the output that is learned is named, where a network writes several."""
 
     def __init__(self, network: TensorDictModule, *, reduction: str = "mean") -> None:
         super().__init__()
         check_choice("reduction", reduction, ("mean", "sum", "none"))
         self.network = network
         self.reduction = reduction
+        self.output = None if self.written is None else output_key(network, self.written)
 
     @property
     def functional(self) -> bool:
@@ -138,6 +144,8 @@ def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = 
             "trailing dim, and one-hot actions fit a one-hot policy alone"
         )
     seen = action.device.type == "cpu" and not hidden_from_python(action)
+    if count is not None and action.is_floating_point():
+        raise UserError(f"actions are whole numbers 0..{count - 1}, got {action.dtype}")
     if count is None or not seen or not action.numel():
         return
     for number in map(int, action.aminmax()):

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from ifo_grounding import keys
 from ifo_grounding.errors import at_least_one
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
@@ -59,6 +60,7 @@ class GoalLoss(SupervisedLoss):
         """Whether a frame is the last of its demonstration, bool [*B, 1]."""
 
     default_keys: Any = _AcceptedKeys
+    written = keys.GOAL_SCORE
     out_keys = [  # noqa: RUF012
         "loss_goal",
         "final_probability",
@@ -104,12 +106,12 @@ class GoalLoss(SupervisedLoss):
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
             if final.is_cuda and self.capturable:  # all in every way: to count them is to wait
-                own, other = pair_scores(self.network, batch, others)
+                own, other = pair_scores(self.network, batch, others, self.output)
                 early, last, before = own, final, ~final
                 told = final.unsqueeze(1).expand_as(other)
             else:
-                own, other = pair_scores(self.network, batch[final], others[final])
-                early, _ = pair_scores(self.network, batch[~final], others[~final, :0])
+                own, other = pair_scores(self.network, batch[final], others[final], self.output)
+                early, _ = pair_scores(self.network, batch[~final], others[~final, :0], self.output)
                 last, before, told = (
                     torch.ones_like(each, dtype=torch.bool) for each in (own, early, other)
                 )

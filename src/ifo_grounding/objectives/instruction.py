@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.modules import set_lenient
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
@@ -90,6 +91,7 @@ class InstructionLoss(SupervisedLoss):
         """No keys of its own: all it reads are the network's."""
 
     default_keys: Any = _AcceptedKeys
+    written = keys.SUITABILITY
     out_keys = [  # noqa: RUF012
         "loss_instruction",
         "positive_probability",
@@ -177,7 +179,7 @@ class InstructionLoss(SupervisedLoss):
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         as_learned = getattr(self.network.module, "as_learned", contextlib.nullcontext)
         with self._mode(), as_learned():
-            own, other = pair_scores(self.network, batch, others)
+            own, other = pair_scores(self.network, batch, others, self.output)
             if self.states is not None:
                 other = torch.cat([other, self._elsewhere(batch)], 1)
         if self.training:
@@ -212,7 +214,7 @@ class InstructionLoss(SupervisedLoss):
         spoken = batch.get(instruction).expand(self.fresh, -1, -1)
         rows = self.negatives.randint(0, len(self.states), (self.fresh,))
         scenes = TensorDict({image: self.states[rows], instruction: spoken[:, 0]}, [self.fresh])
-        first, others = pair_scores(self.network, scenes, spoken[:, 1:])
+        first, others = pair_scores(self.network, scenes, spoken[:, 1:], self.output)
         return torch.cat([first.unsqueeze(1), others], 1).T
 
     def _non_negative(self, own: Tensor, other: Tensor) -> Tensor:

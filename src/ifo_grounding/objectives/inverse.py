@@ -42,6 +42,7 @@ class InverseLoss(SupervisedLoss):
 
     default_keys: Any = _AcceptedKeys
     out_keys = ["loss_inverse", "accuracy"]  # noqa: RUF012
+    written = keys.LOGITS
     capturable = True
 
     @dispatch
@@ -51,7 +52,7 @@ class InverseLoss(SupervisedLoss):
         action = tensordict.get(self.tensor_keys.action)
         with self._mode():
             out = self.network(tensordict.select(*self.network.in_keys))
-        logits = out.get(self.network.out_keys[0])
+        logits = out.get(self.output)
         check_action(action, logits.shape[:-1], logits.shape[-1])
         action = action.long()
         loss = F.cross_entropy(

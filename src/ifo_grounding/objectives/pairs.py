@@ -5,10 +5,13 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from ifo_grounding import keys
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
+from ifo_grounding.modules import output_key
 from ifo_grounding.objectives.mixture import MixtureEstimate
 
 ESTIMATED = "estimated"
@@ -67,8 +70,9 @@ class NegativeInstructions(nn.Module):
         super().__init__()
         if not 0 <= near < 1:
             raise UserError(f"near is a share in [0, 1), got {near}")
-        if pool.ndim != 2 or pool.dtype.is_floating_point:
-            raise UserError(f"pool must be token ids [P, L], got {pool.dtype} {list(pool.shape)}")
+        if not isinstance(pool, Tensor) or pool.ndim != 2 or pool.dtype.is_floating_point:
+            found = (pool.dtype, [*pool.shape]) if isinstance(pool, Tensor) else type(pool).__name__
+            raise UserError(f"pool must be token ids [P, L], such as demos.pool(), got {found}")
         estimated = removal_rate == ESTIMATED
         if not estimated and (isinstance(removal_rate, str) or not 0 <= removal_rate < 1):
             raise UserError(
@@ -206,7 +210,10 @@ class NegativeInstructions(nn.Module):
 
 
 def pair_scores(
-    network: TensorDictModule, batch: TensorDictBase, others: Tensor
+    network: TensorDictModule,
+    batch: TensorDictBase,
+    others: Tensor,
+    output: NestedKey | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Score each row's own instruction and others: logits [N] and [N, K].
 
@@ -218,6 +225,8 @@ def pair_scores(
         network: images and an instruction, its last input, to a logit [*B, 1].
         batch: its inputs, batch size [N].
         others: token ids [N, K, L].
+        output: where the network writes; by default ``suitability``, ``goal_score``, or all that it
+            writes.
     """
     *pixel_keys, instruction_key = network.in_keys
     both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
@@ -235,7 +244,8 @@ def pair_scores(
     else:
         rows = torch.arange(len(both), device=both.device).repeat_interleave(count)
         pairs = batch.select(*pixel_keys)[rows].set(instruction_key, both.flatten(0, 1))
-        scores = network(pairs).get(network.out_keys[0])
+        written = output or output_key(network, keys.SUITABILITY, keys.GOAL_SCORE)
+        scores = network(pairs).get(written)
     scores = scores.reshape(-1, count)
     return scores[:, 0], scores[:, 1:]
 

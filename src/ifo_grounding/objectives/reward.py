@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding import keys
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
 
 
@@ -29,7 +29,7 @@ class RewardLoss(SupervisedLoss):
         network: an image, an instruction and an action, its last input, to a logit, as
             ``make_reward_model`` builds it. With ``all_actions`` images are encoded once for both
             actions.
-        n_actions: number of actions.
+        n_actions: number of actions; networks of this library know theirs.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         generator: where random numbers come from; None is the global generator.
 
@@ -51,6 +51,7 @@ class RewardLoss(SupervisedLoss):
         """The labelled action, integer [*B]."""
 
     default_keys: Any = _AcceptedKeys
+    written = keys.ACTION_SCORE
     out_keys = ["loss_reward", "positive_probability", "negative_probability"]  # noqa: RUF012
 
     def __init__(
@@ -63,7 +64,10 @@ class RewardLoss(SupervisedLoss):
     ) -> None:
         super().__init__(network, reduction=reduction)
         known = getattr(getattr(network, "shapes", None), "n_actions", None)
-        self.n_actions = n_actions or known or keys.N_ACTIONS
+        count = known if n_actions is None else n_actions
+        if count is None:
+            raise UserError("how many actions there are is not known: give n_actions=")
+        self.n_actions = at_least_one("n_actions", count)
         if self.n_actions < 2:
             raise UserError("a single action has no different ones to serve as negatives")
         self.generator = generator
@@ -81,8 +85,8 @@ class RewardLoss(SupervisedLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of labelled actions against randomly different ones."""
         self._require(tensordict)
-        action = tensordict.get(self.tensor_keys.action).long()
-        both = torch.stack([action, self._different(action)], -1)
+        action = self._actions(tensordict)
+        both = torch.cat([action, self._different(action)], -1)
         with self._mode():
             right, wrong = self._scores(tensordict, both).unbind(-1)
         halves = F.softplus(-right), F.softplus(wrong)
@@ -139,7 +143,11 @@ class RewardLoss(SupervisedLoss):
         )
 
     def _actions(self, tensordict: TensorDictBase) -> Tensor:
-        return tensordict.get(self.tensor_keys.action).long().unsqueeze(-1)
+        """Return the labelled actions [*B, 1]."""
+        action = tensordict.get(self.tensor_keys.action)
+        if action.is_floating_point():
+            raise UserError(f"actions are whole numbers, got {action.dtype}")
+        return action.long().unsqueeze(-1)
 
     def _different(self, action: Tensor) -> Tensor:
         """Draw another action than ``action`` [*B], uniform among the others."""
@@ -160,7 +168,7 @@ class RewardLoss(SupervisedLoss):
             return every.gather(-1, actions)
         inputs = tensordict.select(*input_keys)
         columns = [
-            self.network(inputs.copy().set(action_key, action)).get(self.network.out_keys[0])
+            self.network(inputs.copy().set(action_key, action)).get(self.output)
             for action in actions.unbind(-1)
         ]
         return torch.cat(columns, -1)

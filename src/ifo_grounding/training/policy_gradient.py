@@ -15,6 +15,7 @@ from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
 from torchrl.objectives.value import GAE
 
 from ifo_grounding import keys
+from ifo_grounding.modules import output_key
 from ifo_grounding.training.environment import make_collector
 from ifo_grounding.training.rehearsal import Rehearsal
 from ifo_grounding.training.supervised import Metrics, make_optimizer, update
@@ -44,7 +45,9 @@ class Learner:
         self.batches: Iterator[TensorDictBase] | None = None
         # Values are given: the estimator would look at nearly all states twice, as next ones too.
         self.advantage = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=None)
-        self.advantage.set_keys(reward=keys.LEARNED_REWARD, value=value.out_keys[0])
+        self.advantage.set_keys(
+            reward=keys.LEARNED_REWARD, value=output_key(value, keys.STATE_VALUE)
+        )
         self.loss = _make_loss(policy, value, config)
         critic = {id(p) for p in value.parameters()}
         self.optimizer = make_optimizer(
@@ -65,7 +68,7 @@ class Learner:
         if self.reference is None:
             return {}
         steps = batch.reshape(-1)
-        parts = steps.select(keys.PIXELS, keys.INSTRUCTION, keys.ACTION).split(4096)
+        parts = steps.select(*self.policy.in_keys, keys.ACTION).split(4096)
         reference = torch.cat([_log_prob(self.reference, part) for part in parts])
         current = torch.cat([_log_prob(self.policy, part) for part in parts])
         away = (current - reference).reshape(*batch.shape, 1)
@@ -145,7 +148,7 @@ def _make_loss(
         )
     else:
         loss = ReinforceLoss(policy, value)
-    loss.set_keys(reward=keys.LEARNED_REWARD, value=value.out_keys[0])
+    loss.set_keys(reward=keys.LEARNED_REWARD, value=output_key(value, keys.STATE_VALUE))
     return loss
 
 

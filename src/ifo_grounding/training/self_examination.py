@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,10 +85,8 @@ class SelfExaminationConfig:
 
     def __post_init__(self) -> None:
         """Refuse unknown algorithms and empty budgets."""
-        check_numbers(self)
+        check_numbers(self, unbounded=["grad_clip", "select_margin"])
         check_choice("algorithm", self.algorithm, ALGORITHMS)
-        if math.isinf(self.lr) or math.isinf(self.value_lr):
-            raise UserError("lr and value_lr must be finite")
         counts = ("iterations", "steps", "epochs", "minibatch", "select_episodes", "max_steps")
         for name in (*counts, "checkpoint_every"):
             at_least_one(name, getattr(self, name))

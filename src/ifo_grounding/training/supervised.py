@@ -72,14 +72,12 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that cannot be."""
-        check_numbers(self)
+        check_numbers(self, unbounded=["grad_clip"])
         for name in ("steps", "batch_size", "iteration", "validate_every"):
             at_least_one(name, getattr(self, name))
         for name in ("lr", "grad_clip"):
             if not getattr(self, name) > 0:
                 raise UserError(f"{name} must be above 0, got {getattr(self, name)}")
-        if math.isinf(self.lr):
-            raise UserError("lr must be finite")
         for name in ("weight_decay", "prior", "evaluate_every"):
             if not getattr(self, name) >= 0:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
@@ -194,7 +192,8 @@ def fit(
         Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
 
     Raises:
-        UserError: where ``buffer`` cannot be sampled, or the checkpoint is of something else.
+        UserError: where ``buffer`` cannot be sampled, the checkpoint is of something else, or the
+            loss is no longer finite.
     """
     if not callable(getattr(buffer, "sample", None)):
         raise UserError(
@@ -240,6 +239,12 @@ def fit(
             steps = range(first, min(first + config.iteration, config.steps))
             metrics = _iterate(loss, buffer, optimizer, config, steps, make_step)
             done = iteration + 1
+            losses = [key for key in metrics if key.startswith("loss_")]
+            if lost := [key for key in losses if not math.isfinite(metrics[key])]:
+                raise UserError(
+                    f"{name} diverged: {', '.join(lost)} no longer finite by step {steps.stop}; "
+                    "learn with a lower lr"
+                )
             if held_out:
                 if done % config.validate_every == 0 or done == iterations:
                     metrics[held_out.metric] = held_out.look()

@@ -1,19 +1,18 @@
-"""What the transforms share: reset masks, judges in eval mode, keys of a judge."""
+"""What the transforms share: reset masks, judges in eval mode, what an environment shows."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from ifo_grounding.attributes import answers
+from ifo_grounding.attributes import answers, first_worker
 from ifo_grounding.errors import UserError
-from ifo_grounding.keys import ACTION_SCORE, GOAL_SCORE, SUITABILITY
+from ifo_grounding.keys import INSTRUCTION
 
 
 def parts_of(transform: Transform) -> list[Transform]:
@@ -149,32 +148,16 @@ def exposes_state(env: EnvBase) -> bool:
 
 
 def instructs(env: EnvBase) -> bool:
-    """Tell whether an environment without transforms, or a worker's, brings instructions."""
-    return any(answers(env, "instructed"))
+    """Tell whether an environment without transforms, or a worker's, brings instructions.
 
-
-def logit_key(judge: TensorDictModuleBase, expected: str) -> NestedKey:
-    """Key under which a TensorDictModule writes its logit.
-
-    Raises:
-        UserError: where ``judge`` is no TensorDictModule, it is unclear which output is meant, or
-            it is what another judge says.
+    One that does not say so itself does where it shows an ``instruction``.
     """
-    if not isinstance(judge, TensorDictModuleBase):
-        raise UserError(
-            f"expected a TensorDictModule that writes {expected!r}, got {type(judge).__name__}"
-        )
-    names = [unravel_key(key) for key in judge.out_keys]
-    for name in names:
-        if name == expected or (isinstance(name, tuple) and name[-1] == expected):
-            return name
-    if len(names) != 1:
-        raise UserError(f"the module writes {names}: one of them must be named {expected!r}")
-    if (written := names[0]) in (ACTION_SCORE, GOAL_SCORE, SUITABILITY):
-        raise UserError(
-            f"the module writes {written!r}: what is needed here is a judge that says {expected!r}"
-        )
-    return written
+    told = [answer for answer in answers(env, "instructed") if answer is not None]
+    if told:
+        return any(told)
+    if isinstance(env, BatchedEnvBase):
+        return instructs(innermost(first_worker(env)))
+    return INSTRUCTION in env.observation_spec.keys(True, True)
 
 
 def flat_logit(logit: Tensor, rows: int, name: NestedKey) -> Tensor:

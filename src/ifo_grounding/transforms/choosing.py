@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.keys import PIXELS, SUITABILITY
-from ifo_grounding.modules import device_of, evaluating
-from ifo_grounding.transforms._common import flat_logit, logit_key
+from ifo_grounding.modules import device_of, evaluating, output_key
+from ifo_grounding.transforms._common import flat_logit
 
 CHOICES = ("random", "best")
 AT_ONCE = 2048
@@ -69,7 +69,7 @@ class PoolScorer:
     def __init__(
         self, classifier: TensorDictModuleBase, pool: Tensor, pixels_key: NestedKey = PIXELS
     ) -> None:
-        self.logit_key = logit_key(classifier, SUITABILITY)
+        self.logit_key = output_key(classifier, SUITABILITY)
         inputs = [unravel_key(key) for key in classifier.in_keys]
         if len(inputs) != 2:
             raise UserError(f"a classifier reads pixels and an instruction, not {inputs}")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
+from math import isfinite, nan
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -14,7 +14,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase, Transform
 
 from ifo_grounding.attributes import stop_of
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, whole
 from ifo_grounding.keys import (
     ACTION,
     ACTION_SCORE,
@@ -24,11 +24,10 @@ from ifo_grounding.keys import (
     NEXT,
     PIXELS,
 )
-from ifo_grounding.modules import device_of, evaluating
+from ifo_grounding.modules import device_of, evaluating, output_key
 from ifo_grounding.transforms._common import (
     EpisodeTransform,
     flat_logit,
-    logit_key,
     parts_of,
 )
 
@@ -103,25 +102,32 @@ class LearnedReward(EpisodeTransform):
             raise UserError("goal_model is for kind='both', which needs it as its second judge")
         if kind == "goal" and form != "probability":
             raise UserError(f"form={form!r} is for the action's reward: a goal pays a probability")
-        if len(weights) != 2:
-            raise UserError(f"weights are two, of the action and of the goal, got {len(weights)}")
+        try:
+            self.action_weight, self.goal_weight = map(float, weights)
+        except (TypeError, ValueError):
+            self.action_weight = self.goal_weight = nan
+        if not isfinite(self.action_weight + self.goal_weight):
+            raise UserError(
+                f"weights are two numbers, of the action and of the goal, got {weights!r}"
+            )
         if isinstance(stop_action, str):
             check_choice("stop_action", stop_action, (FROM_ENV,))
         elif stop_action is not None:
             try:
-                stop_action = operator.index(stop_action)
-            except TypeError:
+                stop_action = whole("stop_action", stop_action)
+            except UserError:
                 raise UserError(
                     f"stop_action is the number of an action, {FROM_ENV!r} or None, got "
                     f"{stop_action!r}"
                 ) from None
+            if stop_action < 0:
+                raise UserError(f"stop_action is an action, from 0 on, got {stop_action}")
         if arrival is not None and (kind == "action" or not 0.0 < arrival <= 1.0):
             raise UserError(
                 f"arrival is a probability of the judge of goals, within 0..1, got {arrival} with "
                 f"kind={kind!r}"
             )
         self.kind, self.form, self.stop_action, self.arrival = kind, form, stop_action, arrival
-        self.action_weight, self.goal_weight = (float(weight) for weight in weights)
         action_judge = None if kind == "goal" else model
         goal_judge = model if kind == "goal" else goal_model
         self.pixels_key = unravel_key(pixels_key)
@@ -130,11 +136,17 @@ class LearnedReward(EpisodeTransform):
         self.reward_key = unravel_key(reward_key)
         inputs: list[NestedKey] = []
         if action_judge is not None:
-            self.action_logit = logit_key(action_judge, ACTION_SCORE)
+            self.action_logit = output_key(action_judge, ACTION_SCORE)
             inputs += [unravel_key(key) for key in action_judge.in_keys]
         if goal_judge is not None:
-            self.goal_logit = logit_key(goal_judge, GOAL_SCORE)
-            inputs += [unravel_key(key) for key in goal_judge.in_keys]
+            self.goal_logit = output_key(goal_judge, GOAL_SCORE)
+            shown = [unravel_key(key) for key in goal_judge.in_keys]
+            if self.pixels_key not in shown:
+                raise UserError(
+                    f"the judge of goals reads {shown}: say which of them is the image after the "
+                    f"step with pixels_key=, it is not {self.pixels_key!r}"
+                )
+            inputs += shown
         super().__init__(in_keys=list(dict.fromkeys(inputs)), out_keys=[self.reward_key])
         self.action_judge, self.goal_judge = action_judge, goal_judge
         self._named: int | None = None
@@ -310,7 +322,24 @@ class LearnedReward(EpisodeTransform):
         return torch.cat(parts).to(home)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Declare the learned reward beside the true one."""
+        """Declare the learned reward beside the true one.
+
+        Raises:
+            UserError: where the environment pays a reward of that name already, or has no such
+                stop.
+        """
+        if self.reward_key in reward_spec.keys(True, True):
+            raise UserError(
+                f"the environment pays {self.reward_key!r} already, which stays where it is: give "
+                "another reward_key, and tell losses with set_keys(reward=...)"
+            )
+        if isinstance(self.stop_action, int) and self.parent is not None:
+            count = getattr(self.parent.full_action_spec.get(self.action_key, None), "n", None)
+            if isinstance(count, int) and self.stop_action >= count:
+                raise UserError(
+                    f"stop_action={self.stop_action} is no action of the environment, whose "
+                    f"actions are 0..{count - 1}"
+                )
         reward_spec[self.reward_key] = Unbounded(
             shape=(*reward_spec.shape, 1), dtype=torch.float32, device=reward_spec.device
         )
