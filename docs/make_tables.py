@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -55,6 +56,11 @@ EARLIER_NOTE = (
     f"{EARLIER} made with other options than `reproduce` says today; its file names them. What"
     " presets say may have changed since, too: `reproduce` with `list=true` says it of each piece."
 )
+STRAYED = "‡"
+STRAYED_NOTE = (
+    f"{STRAYED} with a seed whose phase 1 was made again on another machine: practice began with"
+    " that one, and its gain is over that one."
+)
 OPTIONS_OF: dict[str, Any] = OmegaConf.to_container(  # type: ignore[assignment]
     OmegaConf.load(ROOT / "recipes" / "conf" / "reproduce.yaml").options_of
 )
@@ -70,11 +76,17 @@ def pieces() -> Pieces:
     )
 
 
-def success(runs: list[dict[str, Any]] | None, name: str) -> str:
-    """Return a policy's success over its seeds and, of phase 2, the paired gain."""
+def success(
+    runs: list[dict[str, Any]] | None, name: str, first: list[dict[str, Any]] | None = None
+) -> str:
+    """Return a policy's success over its seeds and, of phase 2, the paired gain.
+
+    It is marked where practice began with another phase 1 than is shown, that of ``first``.
+    """
     if not runs:
         return NOT_RUN
-    rate = f"{brief(two_level_bootstrap(outcomes(runs, name)))}{mark(runs)}"
+    marks = mark(runs) + (STRAYED if strayed(runs, first or []) else "")
+    rate = f"{brief(two_level_bootstrap(outcomes(runs, name)))}{marks}"
     if name == "phase1":
         return rate
     kept = sum(same_policy(run, name) for run in runs)
@@ -83,6 +95,16 @@ def success(runs: list[dict[str, Any]] | None, name: str) -> str:
     gain = paired_difference(outcomes(runs, "phase1"), outcomes(runs, name))
     aside = f"; {KEPT}: {kept} of {len(runs)} seeds" if kept else ""
     return f"{rate}<br>{brief(gain)} points{aside}"
+
+
+def strayed(runs: list[dict[str, Any]], first: list[dict[str, Any]]) -> bool:
+    """Whether any began with another phase 1 than that of the same seed in ``first``."""
+    began = {run["options"]["seed"]: run["results"]["phase1"]["outcomes"] for run in first}
+    return any(
+        run["results"]["phase1"]["outcomes"] != began.get(run["options"]["seed"])
+        for run in runs
+        if run["options"]["seed"] in began
+    )
 
 
 def mark(runs: list[dict[str, Any]]) -> str:
@@ -110,7 +132,8 @@ def is_of_today(options: dict[str, Any]) -> bool:
 def noted(*parts: str) -> str:
     """Return parts of a page, with what the mark means where it occurs."""
     text = "\n\n".join(part for part in parts if part)
-    return f"{text}\n\n{EARLIER_NOTE}" if EARLIER in text else text
+    notes = {EARLIER: EARLIER_NOTE, STRAYED: STRAYED_NOTE}
+    return "\n\n".join([text, *(note for sign, note in notes.items() if sign in text)])
 
 
 def mean(shares: list[float], digits: int = 2) -> str:
@@ -159,7 +182,7 @@ def success_rows(
         for preset in presets:
             runs = [found.get((task, preset, phase)) for phase in phases]
             shown = ["phase1", *["phase2"] * (len(phases) - 1)]
-            values = [success(some, name) for some, name in zip(runs, shown, strict=True)]
+            values = [success(some, name, runs[0]) for some, name in zip(runs, shown, strict=True)]
             counts = [len(some) for some in runs if some]
             seeds = " / ".join(map(str, counts if len(set(counts)) > 1 else counts[:1]))
             rows.append({"task": "", "by": named(preset, phases[0]), "seeds": seeds})
@@ -169,7 +192,9 @@ def success_rows(
                     row = {"task": "", "by": named(preset, phase), "seeds": str(len(some))}
                     same = len(some) == len(runs[0] or [])
                     before = "as above" if same else success(some, "phase1")
-                    rows.append({**row, heads[0]: before, heads[1]: success(some, "phase2")})
+                    rows.append(
+                        {**row, heads[0]: before, heads[1]: success(some, "phase2", runs[0])}
+                    )
     return rows
 
 
@@ -185,8 +210,11 @@ def suitability_rows(found: Pieces) -> list[dict[str, str]]:
             runs = found.get((task, preset, "phase-1"), [])
             row = {"task": "", "by": f"`{preset}`"}
             for name, title in heads.items():
-                values = [brief(restored(Rate, r["results"]["suitability"][name])) for r in runs]
-                row[title] = "<br>".join(values) + mark(runs) or NOT_RUN
+                values = [
+                    brief(restored(Rate, run["results"]["suitability"][name])) + mark([run])
+                    for run in runs
+                ]
+                row[title] = "<br>".join(values) or NOT_RUN
             rows.append(row)
     return rows
 
@@ -203,7 +231,8 @@ def counted(
         if runs := found.get((task, preset, phase)):
             counts = [read(run["results"]) for run in runs]
             added = {name: f"{sum(some.get(name, 0) for some in counts):,}" for name in names}
-            rows.append({"task": task, "preset": named(preset, phase), **added})
+            of = {"task": task, "preset": named(preset, phase), "seeds": str(len(runs))}
+            rows.append({**of, **added})
     return rows
 
 
@@ -249,11 +278,13 @@ def content() -> str:
         " the demonstrations mentions.",
         noted(table(success_rows(found, TABLE_4, ZERO_SHOT_PHASES, phases[:2]))),
         "## Figure 5: what is wrong with unsuitable choices",
+        "Of 20,000 states with each seed, added over seeds.",
         table(
             counted(found, ("phase-1",), ERRORS, lambda results: results["suitability"]["errors"])
         ),
         "## Figure 6: what phase 2 changes",
-        "Scenes that only one of the two policies solves, by what the other one did there.",
+        "Scenes that only one of the two policies solves, by what the other one did there, added"
+        " over seeds.",
         table(change_rows(found)),
         "Scenes that both solve, by another path or by the same:",
         table(path_rows),
@@ -346,7 +377,8 @@ def zero_shot_content() -> str:
     return "\n\n".join(
         [
             table(rates),
-            "Success of each held-out pair, and where the agent ended instead; of wrong objects,"
+            "Trained pairs: the mean over seeds, with the interval of one seed's scenes. Success of"
+            " each held-out pair, and where the agent ended instead; of wrong objects,"
             " how many share the colour, the shape or neither with the right one:",
             table(endings),
         ]
@@ -366,10 +398,10 @@ def readme_tables() -> str:
                 found.get((task, preset, phase)) for phase in ("phase-1", "pairs-5000")
             )
             rows[-1][f"`{preset}`, 1"] = success(first, "phase1")
-            rows[-1][f"`{preset}`, 2"] = success(practised, "phase2")
+            rows[-1][f"`{preset}`, 2"] = success(practised, "phase2", first)
             if preset == "paper":
                 paid = found.get((task, preset, GOAL))
-                rows[-1][f"2, {PAID_FOR_GOALS}"] = success(paid, "phase2")
+                rows[-1][f"2, {PAID_FOR_GOALS}"] = success(paid, "phase2", first)
                 seeds = [str(len(some or [])) for some in (first, practised, paid)]
                 rows[-1]["seeds"] = " / ".join(seeds)
             chosen = [run["results"]["suitability"]["rate"]["rate"] for run in first or []]
@@ -409,10 +441,8 @@ def zero_shot_common(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
 def zero_shot_rates(runs: list[dict[str, Any]], phase: str) -> dict[str, str]:
     """Return success on held-out and on trained pairs."""
     trained = [run["results"]["trained"][phase]["counts"] for run in runs]
-    of_trained = wilson(
-        sum(counts["success"] for counts in trained),
-        sum(sum(counts.values()) for counts in trained),
-    )
+    scenes = sum(trained[0].values())  # the same ones with every seed
+    of_trained = wilson(round(fmean(counts["success"] for counts in trained)), scenes)
     reported = TABLE_4[runs[0]["options"]["task"]]
     return {
         "seeds": str(len(runs)),

@@ -134,7 +134,8 @@ def open_stage(
         keep_machine(stage, options.device)
         stage.begin()
         if name not in OF_LOOKS:
-            keep_options(run, options, ["simulator", *common, "networks", *sections])
+            of_stage = ["simulator", *common, "networks", *sections]
+            stage.replacing = functools.partial(keep_options, run, options, of_stage)
     if stage.result is not None:
         doing = "done before"
     elif run.record(name):

@@ -4,6 +4,7 @@ python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 """
 
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,8 @@ from ifo_grounding.files import home, read_json
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.training import Run
 
+PLACES = ("run", "base", "results")
+"""Options that say where a piece lies, and nothing of what it is."""
 GOAL = "goal-pairs-5000"
 """Phase 2 paid for the goal, of the preset whose own phase 2 is paid for actions."""
 PHASES = ("phase-1", "pairs-5000", "pairs-10000", GOAL)
@@ -66,7 +69,8 @@ class Piece:
         if not self.file.exists():
             return False
         made = read_json(self.file)
-        said = {each.partition("=")[0] for each in saying(made) ^ {*self.arguments}} - {*RUNNING}
+        other = saying(made) ^ {*self.arguments}
+        said = {each.partition("=")[0] for each in other} - {*RUNNING, *PLACES}
         then, now = (flat(each) if said else {} for each in (made["options"], self.today))
         return said <= now.keys() and all(
             then[name] == now[name] if name in then else not now[name] for name in said
@@ -77,19 +81,14 @@ class Piece:
         """The options that its call has today."""
         return today(self.arguments)
 
-    def otherwise(self) -> list[str]:
-        """Return what the call of its file said otherwise than today's: it is made anew."""
+    def changed(self) -> list[str]:
+        """Return what is said otherwise today than the options of its file, if there is one.
+
+        What presets and budgets say is not part of its command, and a file that was made before
+        they changed still counts as done: its numbers are those of the options that it holds.
+        """
         if not self.file.exists():
             return []
-        other = saying(read_json(self.file)) - {*self.arguments}
-        return sorted(each for each in other if each.partition("=")[0] not in RUNNING)
-
-    def changed(self) -> list[str]:
-        """Return what today's presets and budgets say otherwise than the options of its file.
-
-        They are not part of its command, and a file that was made before they changed still counts
-        as done: its numbers are those of the options that it holds.
-        """
         return changes(read_json(self.file)["options"], self.arguments)
 
     def of_another_phase_1(self) -> bool:
@@ -124,7 +123,7 @@ class Piece:
 
 def saying(made: dict[str, Any]) -> set[str]:
     """Return the arguments of the call of ``ifo-grounding run study`` that a file is of."""
-    return {*made["command"].split()[3:]}
+    return {*shlex.split(made["command"])[3:]}
 
 
 def pieces(options: DictConfig) -> list[list[Piece]]:
@@ -277,13 +276,13 @@ def to_make(chain: list[Piece]) -> list[Piece]:
     """Return what is missing of a chain: pieces that are not done, and runs that they begin with.
 
     Files of results are kept with the code, runs are not: on another machine a piece may be done
-    whose run is not there.
+    whose run is not there, or was interrupted while it was made again.
     """
-    bases = {piece.base for piece in chain if not (piece.done or piece.folder.exists())}
+    bases = {piece.base for piece in chain if not (piece.done or Run(piece.run).begun)}
     return [
         piece
         for piece in chain
-        if not piece.done or (piece.run in bases and not (piece.folder / "stages").is_dir())
+        if not piece.done or (piece.run in bases and not Run(piece.run).is_current("evaluate"))
     ]
 
 
@@ -294,7 +293,7 @@ def reproduce(options: DictConfig) -> list[Piece]:
         for piece in (piece for chain in chains for piece in chain):
             there = "other  " if piece.file.exists() else "not run"
             print("done   " if piece.done else there, piece.file)
-            if changed := piece.changed() if piece.done else piece.otherwise():
+            if changed := piece.changed():
                 print("        made with", ", ".join(changed))
         return []
     failed: list[Piece] = []

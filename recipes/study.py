@@ -3,7 +3,7 @@
 python recipes/study.py task=move budget=study demonstrations.n=1000 seed=0 results=results/study
 """
 
-from _results import keep_result, write_result
+from _results import check_result, keep_result, write_result
 from _shared import open_run
 from controls import run_controls
 from evaluate import evaluate
@@ -18,6 +18,7 @@ from ifo_grounding.report.audit import PANELS
 
 
 def study(options: DictConfig) -> dict:
+    check_result(options)
     train_phases(options)
     practised = options.phase2 and options.practise
     if practised and options.controls.run:

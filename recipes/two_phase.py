@@ -31,7 +31,13 @@ def two_phase(options: DictConfig) -> dict:
 def train_phases(options: DictConfig) -> None:
     check(options)  # first, for a new run takes over what its base has made
     run = open_run(options)
-    write_json(run / MADE, plain(options))
+    if not run.begun:
+        write_json(run / MADE, plain(options))
+    make_phases(options)
+    write_json(run / MADE, plain(options))  # now that all of it was made with these
+
+
+def make_phases(options: DictConfig) -> None:
     # Phase 1: imitation from observation.
     record(options)  # first, for they hold the words of worlds with a vocabulary of their own
     collect(options)

@@ -156,6 +156,10 @@ def imitate_with(
         best = best_beginning(options, stage, seen, held_out, build)
         best.learn()
         results = stage.finish(measured(best.loss.network, options))
+    options = options.copy()
+    if name in SENTENCES:  # for the record
+        options.network = "film"
+        options.networks.update(SENTENCES[name].network)
     options.variant = name if options.world.holdout_visible else f"{name}-absent"
     keep_result(options, write_result(options, results, "run zero_shot"))
     return results

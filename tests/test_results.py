@@ -177,7 +177,7 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
         ("paper", "goal-pairs-5000", "pairs-5000", of_paper),
     ):
         piece = {
-            "options": {"task": "pick", "network": preset, "variant": phase, **said},
+            "options": {"task": "pick", "network": preset, "variant": phase, "seed": 0, **said},
             "results": results[like],
             "command": f"ifo-grounding run study variant={phase}",
             "provenance": {"commit": "abc", "machine": "a machine"},
@@ -192,11 +192,11 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
         "<br>+25.0 [",
         "| **pick** | the paper | 90.2% |",
         "|  | `film` | not run | not run | not run |\n|  | `strong` | 75.0% [",
-        "| pick | `strong` | 15 | 0 | 0 | 5 | 0 | 0 |",
-        "| phase 2 alone | pick | `strong` | 2 | 0 | 0 | 0 |",
-        "| pick | `strong` | 1 | 3 |",
+        "| pick | `strong` | 1 | 15 | 0 | 0 | 5 | 0 | 0 |",
+        "| phase 2 alone | pick | `strong` | 1 | 2 | 0 | 0 | 0 |",
+        "| pick | `strong` | 1 | 1 | 3 |",
         "|  | `paper`, paid for goals | 1 | as above | 75.0% [",
-        "| phase 2 alone | pick | `paper`, paid for goals | 2 | 0 | 0 | 0 |",
+        "| phase 2 alone | pick | `paper`, paid for goals | 1 | 2 | 0 | 0 | 0 |",
         "13.0% [10.3,\u00a016.2]",
     ):
         assert shown in text
@@ -204,3 +204,10 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
     first, second = row.split(" | ")[3:5]
     assert "†" not in first and "]†<br>" in second
     assert text.count("† made with other options than `reproduce` says today") == 1
+    assert "‡" not in text
+    again = read_json(folder / "paper-goal-pairs-5000.json")
+    again["results"]["phase1"]["outcomes"] = "e0"  # phase 1 was made again, and another came of it
+    write_json(folder / "paper-goal-pairs-5000.json", again)
+    text = script.content()
+    assert "|  | `paper`, paid for goals | 1 | as above | 75.0% [" in text
+    assert "]‡<br>+37.5 [" in text and "‡ with a seed whose phase 1 was made again" in text

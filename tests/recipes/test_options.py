@@ -31,7 +31,7 @@ STAGES_OF_PHASE_1 = (
         ("world.layout.objects=[a,b]", "objects"),
         ("self_examine.pairs=2.5", "self_examine.pairs must be a whole number, got 2.5"),
         ("self_examine.lr=nan", "lr must be a number, got nan"),
-        ("self_examine.lr=inf", "lr and value_lr must be finite"),
+        ("self_examine.lr=inf", "lr must be finite"),
         ("networks.features=2.5", "features must be a whole number"),
         ("threads=1.5", "threads must be a whole number"),
         ("self_examine.value_warmup=30", "the policy would never learn"),
@@ -228,6 +228,35 @@ def test_a_run_says_where_each_stage_was_done(compose, monkeypatch):
     stage.checkpoint.unlink()  # it begins anew
     _shared.open_stage(options, "imitate", ["imitate"], needs=[])
     assert _shared.machines(run) == {**done, "imitate": ["a GPU"]}
+
+
+def test_a_call_that_replaced_nothing_leaves_the_options_that_a_run_was_made_with(compose):
+    import _shared
+    from record_demonstrations import record
+
+    options = compose("two_phase", "demonstrations.n=20")
+    record(options)
+    run = _shared.open_run(options)
+    options.demonstrations.n = 30
+    _shared.open_stage(options, "record_demonstrations", ["demonstrations"], needs=[])  # and killed
+    assert _shared.made_with(run)["demonstrations"]["n"] == 20
+    record(options)
+    assert _shared.made_with(run)["demonstrations"]["n"] == 30
+
+
+def test_the_small_file_of_another_run_is_not_replaced(compose, tmp_path):
+    from _results import keep_result
+
+    options = compose("two_phase", f"results={tmp_path / 'small files'}")
+    keep_result(options, {"options": {"run": options.run}, "results": 1})
+    keep_result(options, {"options": {"run": options.run}, "results": 2})
+    options.run = "another"
+    with pytest.raises(UserError, match="tell them apart with variant="):
+        keep_result(options, {"options": {"run": "another"}, "results": 3})
+    options.variant = "mine"
+    keep_result(options, {"options": {"run": "another"}, "results": 3})
+    found = [read_json(file)["results"] for file in sorted((tmp_path / "small files").iterdir())]
+    assert sorted(found) == [2, 3]
 
 
 def test_what_an_interrupted_stage_builds_on_is_not_replaced(compose):

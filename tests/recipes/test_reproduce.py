@@ -33,7 +33,7 @@ def options(recipes, tmp_path, monkeypatch):
 
 
 def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
-    from reproduce import pieces, reproduce
+    from reproduce import pieces, reproduce, to_make
 
     asked = options("figure=6", "tasks=[move]", "presets=[strong]")
     ((first, second),) = pieces(asked)
@@ -77,6 +77,17 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(options, capsys):
     ((told, _),) = pieces(said)
     assert told.arguments != first.arguments and told.today["inverse"]["batch_size"] == 512
     assert told.done
+    # So is one that names the folder in another way.
+    elsewhere = options("figure=6", "tasks=[move]", "presets=[strong]")
+    elsewhere.results = f"{elsewhere.results}/../results"
+    assert all(piece.done for (chain,) in [pieces(elsewhere)] for piece in chain)
+    # A phase 1 that was interrupted while it was made again is what others wait for.
+    for piece in (first, second):
+        shutil.rmtree(piece.folder)
+    second.file.rename(second.file.with_suffix(".kept"))
+    (first.folder / "stages").mkdir(parents=True)
+    assert [piece.run for piece in to_make([first, second])] == [first.run, second.run]
+    second.file.with_suffix(".kept").rename(second.file)
     # Other options, another piece; elsewhere, the same.
     for said, done in (("preset.strong.goal.steps=11", False), ("all.threads=2", True)):
         ((_, changed),) = pieces(

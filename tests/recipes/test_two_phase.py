@@ -454,6 +454,6 @@ def test_a_call_that_was_refused_does_not_keep_a_run_from_its_base(compose, tmp_
     record(compose("record_demonstrations", f"run={tmp_path / 'first'}"))
     with pytest.raises(UserError, match="is missing"):
         label(compose("label"))
-    assert (tmp_path / "run" / "options.json").exists()
+    assert (tmp_path / "run" / "machines.json").exists()
     run = open_run(compose("label", f"base={tmp_path / 'first'}"))
     assert run.record("record_demonstrations")

@@ -6,7 +6,7 @@ import csv
 import importlib.util
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +155,7 @@ class Stage:
         result: what :meth:`finish` was given, or None where the stage is still to be done.
         continues: whether it was begun before, and left a checkpoint.
         checkpoint: file for its checkpoint.
+        replacing: called by :meth:`replace`, where something is to be noted then.
     """
 
     def __init__(
@@ -168,6 +169,7 @@ class Stage:
         self.checkpoint = run.folder / "checkpoints" / f"{name}.pt"
         left = _checkpoints(self.checkpoint)
         self.continues = bool(left)
+        self.replacing: Callable[[], None] | None = None
         self._start = time.monotonic() - (sum(map(spent, left)) if self.result is None else 0.0)
 
     def begin(self) -> None:
@@ -177,6 +179,8 @@ class Stage:
     def replace(self) -> None:
         """Forget that the stage is done: what was made with other settings is written over now."""
         self.run._record_path(self.name).unlink(missing_ok=True)
+        if self.replacing is not None:
+            self.replacing()
 
     def finish(
         self, result: dict[str, Any], history: Sequence[Metrics] | None = None
