@@ -17,6 +17,8 @@ from ifo_grounding.training.supervised import Log, Metrics
 
 EXTRAS = ("tensorboard", "wandb")
 """Loggers that are packages of their own, and extras of this one."""
+NEEDS = ".needs.json"
+"""How the note of what an unfinished stage builds on is named, after the stage."""
 LOGGERS = ("csv", *EXTRAS, "none")
 
 
@@ -96,6 +98,7 @@ class Run:
         """
         if self.begun:
             return
+        self._drop_notes()
         if self.folder.is_dir() and any(self.folder.iterdir()):
             raise UserError(f"{self.folder} holds other files and no run: name another run")
         if not (other.folder / "stages").is_dir():
@@ -106,6 +109,14 @@ class Run:
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(other.folder, copy, ignore=passing)
         copy.rename(self.folder)
+
+    def _drop_notes(self) -> None:
+        """Forget stages that were begun and left no checkpoint."""
+        checkpoints = self.folder / "checkpoints"
+        for note in checkpoints.glob(f"*{NEEDS}"):
+            note.unlink()
+        if checkpoints.is_dir() and not any(checkpoints.iterdir()):
+            checkpoints.rmdir()
 
     def stage(self, name: str, settings: Any, needs: Sequence[str] = ()) -> Stage:
         """Return a stage, done only if its settings and all that it needs are as they were."""
@@ -128,10 +139,11 @@ class Run:
 
     def unfinished_on(self, name: str) -> str | None:
         """Return an interrupted stage that builds on another as that is now, None without any."""
-        for begun in sorted((self.folder / "checkpoints").glob("*.json")):
-            left = _checkpoints(begun.with_suffix(".pt"))
-            if left and self._builds_on(read_json(begun), name):
-                return begun.stem
+        for note in sorted((self.folder / "checkpoints").glob(f"*{NEEDS}")):
+            begun = note.name.removesuffix(NEEDS)
+            left = _checkpoints(note.with_name(f"{begun}.pt"))
+            if left and self._builds_on(read_json(note), name):
+                return begun
         return None
 
     def _builds_on(self, record: dict[str, Any], name: str) -> bool:
@@ -172,9 +184,13 @@ class Stage:
         self.replacing: Callable[[], None] | None = None
         self._start = time.monotonic() - (sum(map(spent, left)) if self.result is None else 0.0)
 
+    @property
+    def _note(self) -> Path:
+        return self.checkpoint.with_suffix(NEEDS)
+
     def begin(self) -> None:
         """Note beside its checkpoint what the stage builds on, for as long as it is not done."""
-        write_json(self.checkpoint.with_suffix(".json"), {"needs": self.needs})
+        write_json(self._note, {"needs": self.needs})
 
     def replace(self) -> None:
         """Forget that the stage is done: what was made with other settings is written over now."""
@@ -192,7 +208,7 @@ class Stage:
         made_of = {"settings": self.settings, "needs": self.needs}
         record = {**made_of, "result": result, "seconds": seconds}
         write_json(self.run._record_path(self.name), record)
-        for path in (*_checkpoints(self.checkpoint), self.checkpoint.with_suffix(".json")):
+        for path in (*_checkpoints(self.checkpoint), self._note):
             path.unlink(missing_ok=True)
         self.result = result
         return result
