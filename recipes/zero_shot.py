@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from _results import keep_result, write_result
+from _results import check_result, keep_result, write_result
 from _shared import changed_networks, open_run, open_stage
 from _worlds import open_world
 from collect_transitions import collect
@@ -146,6 +146,8 @@ def imitate_with(
     name: str, seen: ReplayBuffer, held_out: ReplayBuffer | None, options: DictConfig
 ) -> dict:
     """Imitate with one variant and keep what was measured."""
+    options.variant = name if options.world.holdout_visible else f"{name}-absent"
+    check_result(options)
     if name in SENTENCES:
         options = options.copy()
         options.imitate.update(SENTENCES[name].imitate)
@@ -156,12 +158,11 @@ def imitate_with(
         best = best_beginning(options, stage, seen, held_out, build)
         best.learn()
         results = stage.finish(measured(best.loss.network, options))
-    options = options.copy()
-    if name in SENTENCES:  # for the record
-        options.network = "film"
-        options.networks.update(SENTENCES[name].network)
-    options.variant = name if options.world.holdout_visible else f"{name}-absent"
-    keep_result(options, write_result(options, results, "run zero_shot"))
+    used = options.copy()
+    if name in SENTENCES:
+        used.network = "film"
+        used.networks.update(SENTENCES[name].network)
+    keep_result(options, write_result(used, results, "run zero_shot"))
     return results
 
 

@@ -44,11 +44,15 @@ def test_variants_leave_a_file_each_and_are_made_once(options, tmp_path):
     compare(options("variants=[sentence]", "run=two", "world.holdout_visible=false"))
     absent = read_json(tmp_path / "move-60-strong-sentence-absent-seed0.json")
     assert set(absent["results"]["held-out"]["by_object"]) <= held_out
+    with pytest.raises(UserError, match="is of the run one, not three"):
+        compare(options("variants=[whole]", "run=three"))
+    assert absent["options"]["network"] == "film"  # which the sentence is of
     with pytest.raises(UserError, match="unknown variant 'hole'"):
         compare(options("variants=[hole]"))
     with pytest.raises(UserError, match="variants are of preset strong"):
         compare(options("preset=paper"))
-    larger = ("run=three", "world.tile_size=16", "imitate.held_out=0.2")
+    elsewhere = f"results={tmp_path / 'larger'}"
+    larger = ("run=three", elsewhere, "world.tile_size=16", "imitate.held_out=0.2")
     assert compare(options("variants=[whole]", *larger))["whole"]["probes"]
 
 
