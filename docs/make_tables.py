@@ -58,8 +58,8 @@ EARLIER_NOTE = (
 )
 STRAYED = "‡"
 STRAYED_NOTE = (
-    f"{STRAYED} with a seed whose phase 1 was made again on another machine: practice began with"
-    " that one, and its gain is over that one."
+    f"{STRAYED} with a seed that practised from another phase 1 than the one shown, of other"
+    f" options ({EARLIER}) or made on another machine: its gain is over its own."
 )
 OPTIONS_OF: dict[str, Any] = OmegaConf.to_container(  # type: ignore[assignment]
     OmegaConf.load(ROOT / "recipes" / "conf" / "reproduce.yaml").options_of

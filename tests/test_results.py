@@ -210,4 +210,4 @@ def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
     write_json(folder / "paper-goal-pairs-5000.json", again)
     text = script.content()
     assert "|  | `paper`, paid for goals | 1 | as above | 75.0% [" in text
-    assert "]‡<br>+37.5 [" in text and "‡ with a seed whose phase 1 was made again" in text
+    assert "]‡<br>+37.5 [" in text and "‡ with a seed that practised from another phase 1" in text
