@@ -101,7 +101,7 @@ def strayed(runs: list[dict[str, Any]], first: list[dict[str, Any]]) -> bool:
     """Whether any began with another phase 1 than that of the same seed in ``first``."""
     began = {run["options"]["seed"]: run["results"]["phase1"]["outcomes"] for run in first}
     return any(
-        run["results"]["phase1"]["outcomes"] != began.get(run["options"]["seed"])
+        run["results"]["phase1"]["outcomes"] != began[run["options"]["seed"]]
         for run in runs
         if run["options"]["seed"] in began
     )

@@ -18,7 +18,6 @@ from ifo_grounding.attributes import answers
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
-from ifo_grounding.transforms._common import innermost
 
 MAX_STEPS = 40
 MAX_STEPS_OF_OTHERS = 1000
@@ -304,7 +303,7 @@ def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
             f"options {sorted(env_options)} are for an environment made from a task's name: "
             "give them to your environment"
         )
-    if False in answers(innermost(env), "instructed"):
+    if False in answers(env, "instructed"):
         raise UserError(
             "an environment made with instructed=False pays no true reward, whatever chooses its "
             "instructions: evaluate in one with instructed=True"

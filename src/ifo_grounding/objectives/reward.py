@@ -144,10 +144,7 @@ class RewardLoss(SupervisedLoss):
 
     def _actions(self, tensordict: TensorDictBase) -> Tensor:
         """Return the labelled actions [*B, 1]."""
-        action = tensordict.get(self.tensor_keys.action)
-        if action.is_floating_point():
-            raise UserError(f"actions are whole numbers, got {action.dtype}")
-        return action.long().unsqueeze(-1)
+        return tensordict.get(self.tensor_keys.action).unsqueeze(-1)
 
     def _different(self, action: Tensor) -> Tensor:
         """Draw another action than ``action`` [*B], uniform among the others."""
@@ -163,6 +160,7 @@ class RewardLoss(SupervisedLoss):
         check_action(
             actions[..., 0], tuple(tensordict.get(input_keys[-1]).shape[:-1]), self.n_actions
         )
+        actions = actions.long()
         if hasattr(self.network, "all_actions"):
             every = self.network.all_actions(*(tensordict.get(key) for key in input_keys))
             return every.gather(-1, actions)

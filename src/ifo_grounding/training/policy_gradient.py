@@ -45,10 +45,10 @@ class Learner:
         self.batches: Iterator[TensorDictBase] | None = None
         # Values are given: the estimator would look at nearly all states twice, as next ones too.
         self.advantage = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=None)
-        self.advantage.set_keys(
-            reward=keys.LEARNED_REWARD, value=output_key(value, keys.STATE_VALUE)
-        )
         self.loss = _make_loss(policy, value, config)
+        worth = output_key(value, keys.STATE_VALUE)
+        for part in (self.advantage, self.loss):
+            part.set_keys(reward=keys.LEARNED_REWARD, value=worth)
         critic = {id(p) for p in value.parameters()}
         self.optimizer = make_optimizer(
             (p for p in policy.parameters() if id(p) not in critic), 1.0
@@ -136,9 +136,8 @@ def _make_loss(
     value: TensorDictModuleBase,
     config: SelfExaminationConfig,
 ) -> LossModule:
-    loss: LossModule
     if config.algorithm == "ppo":
-        loss = ClipPPOLoss(
+        return ClipPPOLoss(
             policy,
             value,
             clip_epsilon=config.clip,
@@ -146,10 +145,7 @@ def _make_loss(
             entropy_coeff=config.entropy,
             normalize_advantage=True,
         )
-    else:
-        loss = ReinforceLoss(policy, value)
-    loss.set_keys(reward=keys.LEARNED_REWARD, value=output_key(value, keys.STATE_VALUE))
-    return loss
+    return ReinforceLoss(policy, value)
 
 
 def _log_prob(policy: ProbabilisticTensorDictSequential, steps: TensorDictBase) -> Tensor:

@@ -25,11 +25,7 @@ from ifo_grounding.keys import (
     PIXELS,
 )
 from ifo_grounding.modules import device_of, evaluating, output_key
-from ifo_grounding.transforms._common import (
-    EpisodeTransform,
-    flat_logit,
-    parts_of,
-)
+from ifo_grounding.transforms._common import EpisodeTransform, flat_logit, parts_of
 
 FROM_ENV = "env"
 KINDS = ("action", "goal", "both")
