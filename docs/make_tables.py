@@ -114,8 +114,8 @@ def same_phase_1(run: dict[str, Any], other: dict[str, Any]) -> bool:
     more or less. How long it imitated goes with a run, and no two runs take as long.
     """
     outcomes = [each["results"]["phase1"]["outcomes"] for each in (run, other)]
-    took = [each.get("stages", {}).get("imitate") for each in (run, other)]
-    return outcomes[0] == outcomes[1] or (None not in took and took[0] == took[1])
+    took = [each["stages"]["imitate"] for each in (run, other)]
+    return outcomes[0] == outcomes[1] or took[0] == took[1]
 
 
 def mark(runs: list[dict[str, Any]]) -> str:
