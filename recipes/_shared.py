@@ -72,15 +72,20 @@ def fewer(number: int, than: int, value: Any, otherwise: Any) -> Any:
 OmegaConf.register_new_resolver("fewer", fewer, replace=True)
 
 
+def settle_demonstrations(options: DictConfig) -> None:
+    """Ask for no more demonstrations than were recorded elsewhere: presets do."""
+    check_values(options)
+    if options.recorded and (number := recorded(options.recorded)) < options.demonstrations.n:
+        options.demonstrations.n = number
+
+
 def open_run(options: DictConfig) -> Run:
     """Return the run of these options, with torch's threads and memory set.
 
     A new one takes over what its ``base`` has made, but for phase 2. Where fewer demonstrations
     were recorded elsewhere than asked for, the options ask for those.
     """
-    check_values(options)
-    if options.recorded and (number := recorded(options.recorded)) < options.demonstrations.n:
-        options.demonstrations.n = number  # presets ask for it
+    settle_demonstrations(options)
     count_held_out(options.imitate.held_out, options.demonstrations.n)
     keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down

@@ -172,7 +172,7 @@ def read_recorded(options: DictConfig) -> Demonstrations:
     if (folder / LIST).exists():
         demos = load_pictures(folder, vocabulary=world.vocabulary, progress=shows_progress(options))
     else:
-        demos = Demonstrations.load(folder)
+        demos = Demonstrations.load(folder).close_episodes()
     if world.vocabulary and demos.vocabulary != world.vocabulary:
         raise UserError(
             f"instructions in {folder} have another vocabulary than the world: record them with "

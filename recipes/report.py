@@ -104,8 +104,9 @@ def episode_pictures(run: Run, world: World, results: dict[str, Any]) -> dict[st
     place, shown = world.pictured(list(range(EPISODES)), **where)
     episodes = record_episodes(policies[-1], place, **shown)
     found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES, **drawn)
-    if len(policies) == 1:
-        return found | step_by_step(policies[0], list(range(TRACED)), run, world)
+    if len(policies) == 1 or results[PHASES[0]]["mode"] != "greedy":
+        # Actions that were drawn are not drawn again: what they solved, these episodes may not.
+        return found | step_by_step(policies[-1], list(range(TRACED)), run, world)
     before, after = (torch.from_numpy(unpacked([{"results": results}], p)[0]) for p in PHASES)
     improved = (after & ~before).nonzero().squeeze(-1)[:TRACED].tolist()
     for title, changed in {

@@ -4,7 +4,7 @@ python recipes/study.py task=move budget=study demonstrations.n=1000 seed=0 resu
 """
 
 from _results import check_result, keep_result, write_result
-from _shared import open_run
+from _shared import open_run, settle_demonstrations
 from controls import run_controls
 from evaluate import evaluate
 from omegaconf import DictConfig
@@ -18,6 +18,7 @@ from ifo_grounding.report.audit import PANELS
 
 
 def study(options: DictConfig) -> dict:
+    settle_demonstrations(options)  # of which its file is named
     check_result(options)
     train_phases(options)
     practised = options.phase2 and options.practise

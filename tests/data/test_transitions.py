@@ -7,8 +7,15 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from torchrl.data import Categorical, OneHot
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.data import Categorical, LazyTensorStorage, OneHot
+from torchrl.envs import (
+    Compose,
+    ParallelEnv,
+    SerialEnv,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
 
 from ifo_grounding.data import (
     Collected,
@@ -127,6 +134,25 @@ def test_the_buffer_takes_sampler_options():
         make_env(), 200, batch_size=7, generator=torch.Generator().manual_seed(0)
     )
     assert buffer.sample().shape == (7,)
+
+
+def test_a_transform_of_the_buffer_sees_images(tmp_path):
+    """Not the codes that they are stored as."""
+
+    class Inverted(Transform):
+        def _apply_transform(self, pixels):
+            return 255 - pixels
+
+    seen = ["pixels", ("next", "pixels")]
+    plain = collect_transitions(make_env(), 200)
+    plain.save(tmp_path / "transitions")
+    inverted, _ = collect_transitions(make_env(), 200, transform=Inverted(seen, seen))
+    loaded, _ = Collected.load(tmp_path / "transitions", transform=Inverted(seen, seen))
+    for buffer in (inverted, loaded):
+        assert buffer[:]["pixels"].equal(255 - plain.buffer[:]["pixels"])
+        assert buffer[:]["next", "pixels"].equal(255 - plain.buffer[:]["next", "pixels"])
+    with pytest.raises(UserError, match="leave storage out"):
+        collect_transitions(make_env(), 20, storage=LazyTensorStorage(20))
 
 
 def test_more_transitions_can_be_added():

@@ -65,6 +65,13 @@ def test_a_missing_file_is_named(tmp_path):
         load(tmp_path / "a.safetensors")
 
 
+@pytest.mark.parametrize("device", ["cdua", "xpu"])
+def test_a_device_that_is_not_there_is_no_fault_of_the_file(small, tmp_path, device):
+    save(make_policy(small), tmp_path / "a.safetensors")
+    with pytest.raises(UserError, match=f"no network can be built on device '{device}' here"):
+        load(tmp_path / "a.safetensors", device=device)
+
+
 @pytest.mark.parametrize("cut", [0, 5, 500, -1])
 def test_a_damaged_file_is_refused(small, tmp_path, cut):
     path = tmp_path / "a.safetensors"

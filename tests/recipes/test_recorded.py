@@ -4,6 +4,7 @@ import pytest
 
 from ifo_grounding.data import Demonstrations, record_demonstrations, save_pictures
 from ifo_grounding.errors import UserError
+from ifo_grounding.files import write_json
 
 
 @pytest.fixture
@@ -39,6 +40,33 @@ def test_both_phases_learn_from_recorded_demonstrations(compose, tmp_path, demos
     with pytest.raises(UserError, match="hold no actions"):
         imitate_truth(options)
     assert (tmp_path / "run" / "stages" / "record_demonstrations.json").exists()
+
+
+@pytest.mark.parametrize("pictures", [False, True])
+def test_stops_that_are_not_shown_are_added(compose, tmp_path, demos, pictures):
+    from _worlds import read_recorded
+
+    frames = [demos[number]["pixels"][:-1] for number in range(len(demos))]
+    open_ended = Demonstrations.from_arrays(
+        frames, demos.sentences(), vocabulary=demos.vocabulary, tile_size=8
+    )
+    (save_pictures if pictures else Demonstrations.save)(open_ended, tmp_path / "shown")
+    read = read_recorded(compose("two_phase", f"recorded={tmp_path / 'shown'}"))
+    assert read.lengths.equal(demos.lengths[: len(read)])
+
+
+def test_a_file_of_results_is_looked_for_by_what_was_recorded(compose, tmp_path, demos):
+    """As it will be named, before anything is trained."""
+    from study import study
+
+    demos.save(tmp_path / "shown")
+    given = [f"recorded={tmp_path / 'shown'}", f"results={tmp_path}"]
+    options = compose("study", "demonstrations.n=3000", *given)
+    file = tmp_path / f"move-40-{options.network}-seed0.json"
+    write_json(file, {"options": {"run": "another"}})
+    with pytest.raises(UserError, match="is of the run another"):
+        study(options)
+    assert not (tmp_path / "run").exists()
 
 
 def test_what_was_recorded_before_goes_with_its_truth(compose, tmp_path, demos):

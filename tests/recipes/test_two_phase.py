@@ -10,6 +10,7 @@ from ifo_grounding import networks
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.report import results_table
+from ifo_grounding.report.results import by_scene
 from pretended_gpu import pretended_gpu
 
 PHASES = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
@@ -281,6 +282,26 @@ def test_a_report_leaves_out_what_is_not_there_or_of_another_phase_1(compose, tm
     assert "Episodes of phase 1" in page
     assert "Imitation" in page
     assert "Self-examination" not in page and "Chosen instructions" not in page
+
+
+@pytest.mark.parametrize("mode", ["greedy", "sampled"])
+def test_changed_scenes_are_shown_of_the_policy_that_was_measured(compose, mode):
+    """Actions that were drawn are not drawn again: what they solved may fail in the picture."""
+    from _shared import open_run
+    from _worlds import open_world
+    from two_phase import train_phases
+
+    from report import episode_pictures
+
+    options = compose("two_phase")
+    train_phases(options)
+    outcomes = {"phase1": torch.zeros(50), "phase2": torch.ones(50)}
+    results = {
+        phase: {"mode": mode, **by_scene(solved.bool())} for phase, solved in outcomes.items()
+    }
+    found = episode_pictures(open_run(options), open_world(options), results)
+    assert "Episodes of phase 2" in found
+    assert ("Solved by phase 2 alone" in found) == (mode == "greedy")
 
 
 def test_nothing_is_shared_or_measured_of_another_phase_1(compose, tmp_path):

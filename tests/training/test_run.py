@@ -97,8 +97,11 @@ def test_a_run_takes_over_what_another_has_finished(tmp_path):
     (first / "logs").mkdir()
     (first / "network.safetensors").write_bytes(b"weights")
     first.stage("sum", {}).finish({"total": 6})
+    (first / "report").mkdir()
+    (first / "report" / "index.html").write_text("what the first run measured")
     second = Run(tmp_path / "second")
     second.take_over(first, without=["sum", "other.safetensors"])
+    assert not (second / "report").exists()
     assert second.stage("sum", {}).result is None
     assert second.stage("count", {"to": 3}).result == {"counted": 3}
     assert second.stage("count", {"to": 4}).result is None

@@ -144,9 +144,28 @@ def test_value_warm_up_leaves_the_policy_as_it_was():
     env, (policy, value) = make_env(), make_networks()
     before = {name: weight.clone() for name, weight in policy.state_dict().items()}
     critic = {name: weight.clone() for name, weight in value.state_dict().items()}
-    self_examine(env, policy, value, config(value_warmup=2), seed=0)
-    assert all(torch.equal(w, before[n]) for n, w in policy.state_dict().items())
-    assert any(not torch.equal(w, critic[n]) for n, w in value.state_dict().items())
+    seen = []
+
+    def look(iteration):
+        seen.append(
+            [
+                all(torch.equal(w, then[n]) for n, w in network.state_dict().items())
+                for network, then in ((policy, before), (value, critic))
+            ]
+        )
+        return {}
+
+    self_examine(
+        env,
+        policy,
+        value,
+        config(iterations=3, value_warmup=2, evaluate_every=1),
+        seed=0,
+        callback=look,
+    )
+    assert seen == [[True, False], [True, False], [False, False]]
+    with pytest.raises(UserError, match="would never learn"):
+        config(iterations=2, value_warmup=2)
 
 
 def test_divergence_from_phase_1_costs_reward():

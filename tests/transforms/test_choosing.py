@@ -181,6 +181,17 @@ def test_candidates_are_distinct_and_uniform():
     assert draw_candidates(2, 3, 6, None).sort(1).values.tolist() == [[0, 1, 2], [0, 1, 2]]
 
 
+def test_choices_do_not_depend_on_how_many_states_are_looked_at_at_once(monkeypatch):
+    found = []
+    for at_once in (2048, 64):
+        monkeypatch.setattr("ifo_grounding.transforms.choosing.AT_ONCE", at_once)
+        choices = choose_instructions(
+            classifier(), POOL, pixels(*range(8)).repeat(25, 1, 1, 1), generator=generator(0)
+        )
+        found.append(choices.chosen)
+    assert torch.equal(*found)
+
+
 def test_no_states_no_choices():
     choices = choose([])
     assert choices.chosen.shape == (0,) and choices.score.shape == (0,)

@@ -104,6 +104,16 @@ def test_goal_judge_sees_the_first_image_and_the_last():
     assert torch.allclose(rollout["next", "learned_reward"], torch.tensor(1 - SURE))
 
 
+def test_the_default_dtype_may_be_another():
+    torch.set_default_dtype(torch.float64)
+    try:
+        paid = make(goal_reward()).rollout(30, expert, break_when_any_done=False)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert paid["next", "learned_reward"].dtype == torch.float32
+    assert paid["next", "learned_reward"].max() > 0
+
+
 def test_truncated_episodes_are_paid_nothing():
     reward = goal_reward()
     env = make(reward, world=CounterWorld((4,), max_steps=1))

@@ -131,7 +131,8 @@ class Collected(NamedTuple):
 
         Args:
             folder: where from.
-            options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``generator``.
+            options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``generator``; a
+                ``transform`` comes after frames are decoded.
         """
         names = ("pixels", "next_pixels", "action", "taken", "kept")
         arrays, facts = load_folder(folder, KIND, VERSION, names, ("tiles",))
@@ -162,11 +163,18 @@ class Collected(NamedTuple):
 def _buffer(
     codec: FrameCodec, codes: Tensor, action: Tensor, after: Tensor, options: dict[str, Any]
 ) -> TensorDictReplayBuffer:
+    if "storage" in options:
+        raise UserError(
+            "the storage is the buffer's own, which holds frames as codes: leave storage out"
+        )
+    further = options.pop("transform", None)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(action)), **options)
     entries = {keys.PIXELS: codes, keys.ACTION: action, keys.NEXT: {keys.PIXELS: after}}
     buffer.extend(TensorDict(entries, [len(action)]))
     # Appended last, for what was stored so far is encoded already.
     buffer.append_transform(FrameDecoder(codec))
+    if further is not None:
+        buffer.append_transform(further)  # it sees what is sampled, decoded
     return buffer
 
 
@@ -198,11 +206,12 @@ def collect_transitions(
         drop_unchanged: whether to leave out unchanged transitions other than stops.
         seed: of the actions; scenes are drawn by the environment.
         progress: whether to show a bar.
-        options: for ``TensorDictReplayBuffer``, such as ``batch_size``, ``sampler``, ``generator``.
+        options: for ``TensorDictReplayBuffer``, such as ``batch_size``, ``sampler``, ``generator``;
+            a ``transform`` comes after frames are decoded.
 
     Raises:
         UserError: where nobody says which action is the stop, and unchanged frames are to be left
-            out; where no step showed anything.
+            out; where no step showed anything; where a ``storage`` is given.
 
     Returns:
         The buffer, which stores codes and decodes them when sampled, and counts per action.

@@ -65,6 +65,8 @@ class PickAndPlaceEnv(EnvBase):
 
     stop_action = keys.STOP
     """The action by which a policy ends an episode."""
+    steps_on = True
+    """A world may be stepped after an end, as if there had been none."""
 
     def __init__(
         self,

@@ -142,6 +142,9 @@ class GymnasiumEnv(EnvBase):
         device: where tensors go.
     """
 
+    steps_on = True
+    """A row may be stepped after its end, to no effect."""
+
     def __init__(
         self,
         make: Make,

@@ -8,16 +8,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ifo_grounding import keys, modules
 from ifo_grounding.attributes import answers
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
+from ifo_grounding.stepping import Policy, actions_of, following
 
 MAX_STEPS = 40
 MAX_STEPS_OF_OTHERS = 1000
@@ -25,8 +26,6 @@ MAX_STEPS_OF_OTHERS = 1000
 MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
 """How actions are chosen: the likeliest, or drawn from the policy's distribution."""
 
-Policy = Callable[[TensorDictBase], TensorDictBase]
-"""Anything that writes an action into a tensordict, a TensorDictModule mostly."""
 OnStep = Callable[[Tensor, TensorDictBase], None]
 """Told, after each step, the rows still running, int64 [R], and their transitions, [R]."""
 
@@ -90,11 +89,9 @@ def play(
     stopped = torch.zeros(rows, dtype=torch.bool, **on)
     active = torch.arange(rows, **on)
     state, reward_key = start, true_reward_key(env)
-    # These are stepped on after an end, which spares new scenes for rows that nobody looks at.
-    runs_on = isinstance(env, PickAndPlaceEnv | GymnasiumEnv)
     with set_exploration_type(MODES[mode]):
         for _ in range(max_steps):
-            state[env.action_key] = _actions(policy, env, state, active)
+            state[env.action_key] = actions_of(policy, env, state, active)
             stepped = env.step(state)
             transition = stepped.reshape(rows)[active]
             after = transition[keys.NEXT]
@@ -108,9 +105,7 @@ def play(
             active = active[~ended]
             if not len(active):
                 break
-            state = env.step_mdp(stepped)
-            if not runs_on:
-                state = env.maybe_reset(state)
+            state = following(env, stepped)
     return Outcomes(success, lengths, stopped)
 
 
@@ -128,43 +123,6 @@ def true_reward_key(env: EnvBase) -> NestedKey:
     raise UserError(
         f"the environment pays {found}: success is seen from the true reward, named {keys.REWARD!r}"
     )
-
-
-def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor) -> Tensor:
-    """Actions for all rows, of which only the active ones were asked of the policy."""
-    if isinstance(policy, RandomPolicy):  # draws for the whole batch of its spec
-        return policy(state)[env.action_key]
-    every = env.action_spec.zero()
-    shape = (env.batch_size.numel(), *every.shape[len(env.batch_size) :])
-    action = every.reshape(shape).clone()
-    asked = policy(state.reshape(shape[0])[active])
-    _remember(asked, env, state, active)
-    chosen = asked[env.action_key]
-    if chosen.shape != (wanted := torch.Size([len(active), *shape[1:]])):
-        raise UserError(
-            f"the policy's actions of {len(active)} rows have the shape {list(chosen.shape)}, the "
-            f"environment takes {list(wanted)}: make it with categorical_action_encoding=True if "
-            "it is one-hot, or a policy for it"
-        )
-    if chosen.is_floating_point() and not action.is_floating_point():
-        raise UserError(
-            f"the policy's actions are {chosen.dtype}, the environment's are numbers of actions: "
-            "make the policy write which action it takes, not values or logits"
-        )
-    action[active] = chosen.to(action)
-    return action.reshape(every.shape)
-
-
-def _remember(asked: TensorDictBase, env: EnvBase, state: TensorDictBase, active: Tensor) -> None:
-    """Pass on what a policy with a memory wrote for the next step, such as a recurrent state."""
-    for key in env.observation_spec.keys(True, True):
-        following = unravel_key((keys.NEXT, key))
-        kept = asked.get(following, None)
-        if kept is None:
-            continue
-        every = env.observation_spec[key].zero().reshape(-1, *kept.shape[1:])
-        every[active] = kept.to(every)
-        state[following] = every.reshape(*env.batch_size, *kept.shape[1:])
 
 
 def most_steps(env_or_task: EnvBase | str, max_steps: int | None) -> int:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
+from ifo_grounding.attributes import answers
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import (
@@ -66,9 +67,9 @@ def record_episodes(
 
     Args:
         policy: writes an action.
-        env_or_task: name of a task, or an instructed environment of
-            :func:`~ifo_grounding.envs.from_gymnasium` with as many rows as scenes are asked for.
-        scenes: numbers of the scenes.
+        env_or_task: name of a task, or an instructed environment with as many rows as scenes are
+            asked for. Those of :func:`~ifo_grounding.envs.from_gymnasium` have numbers.
+        scenes: numbers of the scenes; of other environments the first ones, ``range(n)``.
         seed: of the stream.
         stream: ``training``, ``validation`` or ``evaluation``.
         mode: ``greedy`` or ``sampled``.
@@ -98,14 +99,15 @@ def record_episodes(
 
     def look(shown: TensorDictBase) -> np.ndarray:
         if not isinstance(env, PickAndPlaceEnv):
-            return shown[keys.PIXELS].cpu().numpy()
+            return shown.reshape(shown.batch_size.numel())[keys.PIXELS].cpu().numpy()
         tile_size = env.tile_size if render_tile_size is None else render_tile_size
         return env.render(tile_size).transpose(0, 3, 1, 2)
 
     frames = [[frame] for frame in look(start)]
     actions: list[list[int]] = [[] for _ in scenes]
-    vocabulary: Vocabulary = getattr(env, "vocabulary", VOCABULARY)
-    sentences = vocabulary.decode(start[keys.INSTRUCTION].cpu())
+    vocabulary: Vocabulary = next(filter(None, answers(env, "vocabulary")), VOCABULARY)
+    told = start.reshape(len(scenes))[keys.INSTRUCTION]
+    sentences = vocabulary.decode(told.cpu())
 
     def keep(rows: Tensor, transition: TensorDictBase) -> None:
         # The grid is drawn as a whole, at the size for people; of others, the rows that moved.

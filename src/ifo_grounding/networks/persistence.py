@@ -39,6 +39,9 @@ MAKERS: dict[str, Callable[..., Any]] = {
 def save(module: nn.Module, path: str | Path) -> None:
     """Write a network built by a ``make_*`` function to ``path``, atomically.
 
+    What it began with (``init_from``) is not kept: train on before it is saved where weights are to
+    decay to what they were there.
+
     Raises:
         UserError: for a module that no ``make_*`` function built.
 
@@ -81,8 +84,10 @@ def load(
         kind: the kind that is expected (``"policy"``, ``"inverse"``, ...); None allows any.
 
     Raises:
-        UserError: where the file is missing, damaged, of another origin, or of another kind.
+        UserError: where the file is missing, damaged, of another origin, or of another kind, or
+            where there is no such device.
     """
+    _check_device(device)
     content, weights = _read(Path(path))
     found = str(content.get("kind"))
     if kind is not None and kind != found:
@@ -95,6 +100,8 @@ def load(
         config = {**BEFORE, **content["config"]}
         module = MAKERS[found](shapes, device=device, seed=0, **options, **config)
         module.load_state_dict(weights)
+    except torch.OutOfMemoryError:
+        raise  # says nothing against the file
     except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(
@@ -102,6 +109,16 @@ def load(
             " train the network again"
         ) from None
     return module
+
+
+def _check_device(device: torch.device | str | None) -> None:
+    try:
+        torch.empty(0, device=device or "cpu")
+    except (RuntimeError, AssertionError) as error:  # the latter where PyTorch is built without it
+        raise UserError(
+            f"no network can be built on device {str(device)!r} here "
+            f"({str(error).splitlines()[0]}): name another, such as 'cpu'"
+        ) from None
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

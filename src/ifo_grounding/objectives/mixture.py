@@ -70,7 +70,7 @@ class MixtureEstimate(nn.Module):
         for kind, (memory, scores) in enumerate(
             [(self.positive, positive), (self.unlabelled, unlabelled)]
         ):
-            scores = scores.detach().flatten().float()[-len(memory) :]
+            scores = scores.detach().flatten().to(memory.dtype)[-len(memory) :]
             places = torch.arange(len(scores), device=memory.device) + self.count[kind]
             memory[places % len(memory)] = scores
             self.count[kind] += len(scores)

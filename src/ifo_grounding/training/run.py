@@ -104,7 +104,7 @@ class Run:
         if not (other.folder / "stages").is_dir():
             raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
         anew = [*without, *(f"{name}.json" for name in without)]
-        passing = shutil.ignore_patterns("logs", "checkpoints", "result.json", *anew)
+        passing = shutil.ignore_patterns("logs", "checkpoints", "result.json", "report", *anew)
         copy = self.folder.with_name(f"{self.folder.name}.copying")
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(other.folder, copy, ignore=passing)

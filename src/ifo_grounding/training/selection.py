@@ -11,11 +11,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
+from ifo_grounding.stepping import actions_of, following
 from ifo_grounding.training.environment import (
     fixes_scenes,
     reseed,
@@ -53,18 +54,16 @@ def _batch_returns(env: EnvBase, policy: nn.Module, max_steps: int) -> Tensor:
     state: TensorDictBase = env.reset()
     rows = env.batch_size.numel()
     total = torch.zeros(rows)
-    alive = torch.ones(rows, dtype=torch.bool)
+    active = torch.arange(rows, device=state["done"].device)
     for _ in range(max_steps):
-        action = torch.zeros(rows, dtype=torch.int64, device=state[keys.PIXELS].device)
-        running = alive.to(action.device)
-        action[running] = policy(state.reshape(rows)[running])[keys.ACTION]
-        stepped = env.step(state.set(keys.ACTION, action.reshape(state.batch_size)))
-        after = stepped[keys.NEXT]
-        total += after[keys.LEARNED_REWARD].reshape(-1).cpu() * alive
-        alive &= ~after["done"].reshape(-1).cpu()
-        if not alive.any():
+        state[env.action_key] = actions_of(policy, env, state, active)
+        stepped = env.step(state)
+        after = stepped[keys.NEXT].reshape(rows)[active]
+        total[active.cpu()] += after[keys.LEARNED_REWARD].reshape(-1).cpu()
+        active = active[~after["done"].reshape(-1)]
+        if not len(active):
             break
-        state = step_mdp(stepped)
+        state = following(env, stepped)
     return total
 
 

@@ -64,7 +64,7 @@ class SelfExaminationConfig:
     kl: float = 0.0
     """Reward that each nat away from the phase-1 policy costs."""
     value_warmup: int = 2
-    """First iterations that train the value head alone."""
+    """First iterations, of more, that train the value head alone."""
     grad_clip: float = 1.0
     """Largest norm of the gradient."""
     select_every: int = 0
@@ -99,6 +99,11 @@ class SelfExaminationConfig:
         for name in ("entropy", "kl", "value_warmup", "select_every", "evaluate_every"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.value_warmup >= self.iterations:
+            raise UserError(
+                f"value_warmup={self.value_warmup} of {self.iterations} iterations: the policy "
+                "would never learn; lower it, or raise iterations"
+            )
 
     @property
     def selection(self) -> SelectionSchedule:

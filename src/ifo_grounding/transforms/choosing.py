@@ -227,13 +227,11 @@ def choose_instructions(
         if pool is None:
             raise UserError("choose_instructions needs a pool of instructions")
         scorer = PoolScorer(classifier, pool)
-    index = draw_candidates(len(pixels), len(scorer.pool), candidates, generator)
-    index = index.to(pixels.device)
     limit = math.log(threshold / (1 - threshold)) if threshold else -math.inf
-    parts = [
-        _search(scorer, some, candidates, limit, best=choose == "best")
-        for some, candidates in zip(pixels.split(AT_ONCE), index.split(AT_ONCE), strict=True)
-    ]
+    parts = []
+    for some in pixels.split(AT_ONCE):
+        index = draw_candidates(len(some), len(scorer.pool), candidates, generator)
+        parts.append(_search(scorer, some, index.to(some.device), limit, best=choose == "best"))
     return Choices(*(torch.cat(part) for part in zip(*parts, strict=True)))
 
 

@@ -255,7 +255,7 @@ class LearnedReward(EpisodeTransform):
             key: self._rows(after if unravel_key(key) == self.pixels_key else before, key)[asked]
             for key in self.goal_judge.in_keys
         }
-        reward = torch.zeros(rows, device=judged.device)
+        reward = torch.zeros(rows, dtype=torch.float32, device=judged.device)
         if len(asked):
             logit = self._score(self.goal_judge, self.goal_logit, entries, len(asked))
             reward[asked] = logit.sigmoid()
