@@ -1,35 +1,33 @@
-"""Step the simulator at random: what the inverse module learns from (paper, 1st-phase)."""
+"""Step the simulator at random: what the inverse model learns from (paper, 1st-phase)."""
 
-from _shared import RANDOM_STEPS, open_stage, shows_progress, tell
-from _worlds import open_world
-from omegaconf import DictConfig
+from _shared import TRANSITIONS, finish, open_stage, shows_progress, simulator_of, tell, world_of
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.config import Options
 from ifo_grounding.data import collect_transitions
 
 
-def collect(options: DictConfig) -> dict:
-    stage = open_stage(options, "collect_transitions", ["transitions"], needs=[])
+def collect(options: Options) -> dict:
+    stage = open_stage(options, "collect_transitions")
     if stage.result is not None:
         return stage.result
-    section, world = options.transitions, open_world(options)
+    section = options.transitions
     collected = collect_transitions(
-        world.simulator(section.num_envs),
+        simulator_of(options, section.num_envs),
         section.n,
         stop_probability=section.stop_probability,
-        stop_action=world.stop,
+        stop_action=world_of(options).stop_action,
         drop_unchanged=section.drop_unchanged,
         seed=options.seed,
         progress=shows_progress(options),
     )
-    stage.replace()
-    collected.save(stage.run / RANDOM_STEPS)
+    collected.save(stage.run / TRANSITIONS)
     counts = {name: getattr(collected.report, name).tolist() for name in ("taken", "kept")}
-    return stage.finish(counts)
+    return finish(options, stage, counts)
 
 
 @recipe_main
-def main(options: DictConfig) -> None:
+def main(options: Options) -> None:
     tell(collect(options))
 
 

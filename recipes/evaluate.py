@@ -1,107 +1,96 @@
-"""Evaluate what a run has trained: success, chosen instructions, labels and judges."""
+"""Evaluate what a run has trained: success, chosen instructions, labels and learned rewards."""
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
-from _options import OF_EVALUATION, as_made
-from _results import keep_result, write_result
 from _shared import (
     CLASSIFIER,
-    CONTROLS,
+    CONTINUED,
     GOAL,
     POLICIES,
     REWARD,
+    chosen_by,
+    evaluation_scenes,
+    finish,
+    load_demonstrations,
     load_network,
-    need_phase_1,
     open_stage,
-    practised_pool,
+    plain,
+    world_of,
+    write_result,
 )
-from _worlds import Grid, World, open_world
-from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.config import Options
 from ifo_grounding.evaluation import (
-    Endings,
     SuccessResult,
     compare_endings,
     compare_success,
-    episode_endings,
     return_correlation,
     reward_audit,
     success_rate,
-    suitable_rate,
 )
 from ifo_grounding.report import results_table
 from ifo_grounding.report.results import packed
 from ifo_grounding.training import Run
-from ifo_grounding.transforms import LearnedReward
+from ifo_grounding.transforms import GoalReward, LearnedReward
 
-PHASES = ("phase1", "phase2")
-NAMES = dict(zip((*PHASES, "continued", "cloned"), (*POLICIES, *CONTROLS), strict=True))
+NAMES = {**POLICIES, "continued": CONTINUED}
 """Policies that a run may have, by their names in the results."""
-STAGES = dict(
-    zip(NAMES, ("imitate", "self_examine", "continue_imitation", "clone_accepted"), strict=True)
-)
-"""The stage that makes each; one whose phase 1 was made anew since belongs to another policy."""
+ROWS = 1000
+"""Episodes that are played side by side."""
+UNTIL_THE_END = 10_000
+"""Worlds have limits of their own."""
 HELD_OUT = 500
-"""Demonstrations, none of them trained on, that the action reward is compared with."""
+"""Demonstrations, none of them trained on, that the reward of actions is compared with."""
+SHOWN = 200
+"""The same, for the log of self-examination."""
 
 
-def evaluate(options: DictConfig) -> dict:
-    phases = ["label", "imitate", "train_instruction", "train_reward", "train_goal", "self_examine"]
-    controls = ["continue_imitation", "clone_accepted"]
-    stage = open_stage(options, "evaluate", list(OF_EVALUATION), needs=[*phases, *controls])
-    if stage.result is not None:
-        return stage.result
+def evaluate(options: Options) -> dict:
+    stage = open_stage(options, "evaluate")
     run = stage.run
-    need_phase_1(run)
-    named = options.world.get("split")
-    if options.evaluate.split == "zero-shot" and named != "train":
+    there = [name for name, file in NAMES.items() if (run / file).exists()]
+    asked = {"policies": there, **plain(options.evaluate), **chosen_by(options)}
+    if stage.result is not None and stage.result.get("of") == asked:
+        return stage.result["results"]
+    run.need(POLICIES["phase1"], "imitate")
+    if options.evaluate.split == "zero-shot" and options.world.get("split") != "train":
         print(
-            f"note: the demonstrations name the pairs of these scenes, too (world.split={named}): "
-            "what is measured is no zero-shot success",
+            "note: the demonstrations name the pairs of these scenes, too (world.split="
+            f"{options.world.get('split')}): what is measured is no zero-shot success",
             file=sys.stderr,
         )
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
-    labels = run.record("label")["result"].get("accuracy")
+    labels = (run.stage("label").result or {}).get("accuracy")
     results: dict[str, Any] = {"labels": labels} if labels else {}
-    there = [name for name, file in NAMES.items() if (run / file).exists()]
-    current = [name for name in there if run.is_current(STAGES[name])]
-    for name in sorted({*there} - {*current}):
-        recipe = "controls" if NAMES[name] in CONTROLS else STAGES[name]
-        print(
-            f"note: {name} builds on what was made anew since, and is left out: run the recipe "
-            f"{recipe} again",
-            file=sys.stderr,
-        )
-    policies = {name: load_network(run, NAMES[name], "imitate", options) for name in current}
-    world = open_world(options)
-    results |= evaluate_policies(policies, world)
-    if world.oracle:
-        results |= evaluate_endings(policies, world)
-        if options.evaluate.states and run.is_current("train_instruction"):
-            results["suitability"] = evaluate_choices(run, world)
-    results |= evaluate_judges(policies["phase1"], run, world)
-    return stage.finish(results)
-
-
-def evaluate_policies(policies: dict[str, Any], world: World) -> dict[str, Any]:
-    """Measure success of each policy on the same fixed scenes, and the gain of phase 2."""
-    measured = measured_success(policies, world)
-    results = success_results(measured)
+    policies = {name: load_network(run, NAMES[name], "imitate", options) for name in there}
+    measured = measured_success(policies, options)
+    results |= success_results(measured)
     if "phase2" in measured:
         results["gain"] = compare_success(measured["phase1"], measured["phase2"]).as_dict()
+    results |= evaluate_truth(policies, run, options)
+    results |= evaluate_rewards(policies["phase1"], run, options)
+    finish(options, stage, {"of": asked, "results": results})
     return results
 
 
-def measured_success(policies: dict[str, Any], world: World) -> dict[str, SuccessResult]:
-    """Measure success of each policy on the evaluation scenes."""
-    section = world.options.evaluate
-    place, shown = world.played(section.episodes, **evaluation_scenes(world.options))
-    return {
-        name: success_rate(policy, place, mode=section.mode, **shown)
-        for name, policy in policies.items()
-    }
+def measured_success(policies: dict[str, Any], options: Options) -> dict[str, SuccessResult]:
+    """Measure success of each policy on the same evaluation scenes."""
+    env, shown = played(options, options.evaluate.episodes)
+    mode = options.evaluate.mode
+    return {name: success_rate(each, env, mode=mode, **shown) for name, each in policies.items()}
+
+
+def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[str, Any]]:
+    """Return the instructed world of the evaluation scenes, and how to play it."""
+    scenes = {**evaluation_scenes(options), **chosen}
+    env = world_of(options).instructed(
+        min(episodes, ROWS), device=options.device, **scenes
+    )
+    how = {"seed": scenes["seed"], "stream": scenes["stream"]}
+    return env, {"episodes": episodes, "max_steps": UNTIL_THE_END, **how}
 
 
 def success_results(measured: dict[str, SuccessResult]) -> dict[str, Any]:
@@ -112,75 +101,106 @@ def success_results(measured: dict[str, SuccessResult]) -> dict[str, Any]:
     }
 
 
-def evaluate_endings(policies: dict[str, Any], world: Grid) -> dict[str, Any]:
-    """Say how the greedy episodes of each phase end, and what phase 2 changes.
-
-    Of a zero-shot evaluation, the same of instructions that name trained pairs alone.
-    """
-    shown = evaluation_scenes(world.options)
-    phases = {name: policies[name] for name in PHASES if name in policies}
-
-    def endings(**scenes: Any) -> dict[str, Endings]:
-        task, options = world.played(world.options.evaluate.episodes, **scenes)
-        return {n: episode_endings(p, task, **options) for n, p in phases.items()}
-
-    found = endings(**shown)
-    results: dict[str, Any] = {"endings": {name: end.as_dict() for name, end in found.items()}}
-    if len(found) > 1:
-        results["changes"] = compare_endings(*found.values())
-    if shown["split"] == "zero-shot":
-        trained = endings(**{**shown, "split": "train"})
-        results["trained"] = {name: end.as_dict() for name, end in trained.items()}
-    return results
-
-
-def evaluate_choices(run: Run, world: Grid) -> dict[str, Any]:
-    """Let the oracle judge the instructions that the instruction module chooses."""
-    options, section = world.options, world.options.instruction
-    result = suitable_rate(
-        load_network(run, CLASSIFIER, "train_instruction", options),
-        world.task,
-        practised_pool(run, options),
-        states=options.evaluate.states,
-        threshold=section.threshold,
-        candidates=section.candidates,
-        choose=section.choose,
-        **world.arguments(**evaluation_scenes(options)),
-    )
-    return result.as_dict()
-
-
-def evaluate_judges(policy: Any, run: Run, world: World) -> dict[str, Any]:
-    """Compare the judges with the expert's actions and with the true success of rollouts."""
+def evaluate_truth(policies: dict[str, Any], run: Run, options: Options) -> dict[str, Any]:
+    """Say what only an oracle knows: how episodes end, and whether chosen instructions suit."""
+    oracle, scenes = world_of(options).oracle, evaluation_scenes(options)
+    if oracle is None:
+        return {}
+    phases = {name: policies[name] for name in POLICIES if name in policies}
+    episodes, splits = options.evaluate.episodes, [scenes["split"]]
+    splits += ["train"] if scenes["split"] == "zero-shot" else []  # beside it, trained pairs
     results: dict[str, Any] = {}
-    options = world.options
-    audited = evaluation_scenes(options)
-    place, shown = world.played(options.evaluate.audit_episodes, waits=True, **audited)
-    if run.is_current("train_reward"):
-        judge = load_network(run, REWARD, "train_reward", options)
-        if world.oracle:
-            demos, truth = world.demonstrate(HELD_OUT, **audited)
-            results["action_reward"] = reward_audit(judge, demos, truth).as_dict()
-        audit = return_correlation(policy, judge, place, average=True, **shown)
-        results["action_return"] = audit.as_dict()
-    if run.is_current("train_goal"):
-        judge = load_network(run, GOAL, "train_goal", options)
-        reward = LearnedReward(judge, "goal", stop_action=world.stop)
-        results["goal_return"] = return_correlation(policy, reward, place, **shown).as_dict()
+    for name, split in zip(("endings", "trained"), splits, strict=False):
+        chosen = {**scenes, "split": split}
+        ends = {n: oracle.endings(policy, episodes, **chosen) for n, policy in phases.items()}
+        results[name] = {n: end.as_dict() for n, end in ends.items()}
+        if len(ends) > 1 and name == "endings":
+            results["changes"] = compare_endings(*ends.values())
+    if options.evaluate.states and (run / CLASSIFIER).exists():
+        classifier = load_network(run, CLASSIFIER, "train_instruction", options)
+        pool, states = load_demonstrations(run).pool(), options.evaluate.states
+        chosen = {**chosen_by(options), **scenes}
+        results["suitability"] = oracle.suitable_rate(
+            classifier, pool, states=states, **chosen
+        ).as_dict()
     return results
 
 
-def evaluation_scenes(options: DictConfig) -> dict[str, Any]:
-    """Return which scenes to evaluate on."""
-    return {name: options.evaluate[name] for name in ("seed", "stream", "split")}
+def evaluate_rewards(policy: Any, run: Run, options: Options) -> dict[str, Any]:
+    """Compare learned rewards with the expert's actions and with the true success of rollouts."""
+    results: dict[str, Any] = {}
+    world, scenes = world_of(options), evaluation_scenes(options)
+    env, shown = played(options, options.evaluate.audit_episodes, waits=True)
+    if (run / REWARD).exists():
+        model = load_network(run, REWARD, "train_reward", options)
+        if world.oracle is not None:
+            demos, truth = world.demonstrate(
+                HELD_OUT, seed=scenes["seed"], stream=scenes["stream"]
+            )
+            assert truth is not None
+            results["action_reward"] = reward_audit(model, demos, truth).as_dict()
+        audit = return_correlation(policy, LearnedReward(model), env, average=True, **shown)
+        results["action_return"] = audit.as_dict()
+    if (run / GOAL).exists():
+        classifier = load_network(run, GOAL, "train_goal", options)
+        reward = GoalReward(classifier, stop_action=world.stop_action)
+        results["goal_return"] = return_correlation(policy, reward, env, **shown).as_dict()
+    return results
+
+
+def audit_callback(
+    policy: Any, reward: LearnedReward | GoalReward, run: Run, options: Options
+) -> Callable[[int], dict[str, float]]:
+    """Return what measures a policy in training on validation scenes: for the log alone."""
+    world, section = world_of(options), options.evaluate
+    scenes = {"stream": "validation", "split": "all"}
+    env, shown = played(options, section.audit_episodes, **scenes)
+    waiting, _ = played(options, section.audit_episodes, waits=True, **scenes)
+    fixed: dict[str, Any] = {}  # the classifier does not change, nor do the expert's actions
+    if world.oracle is not None:
+        chosen = world.oracle.suitable_rate(
+            load_network(run, CLASSIFIER, "train_instruction", options),
+            load_demonstrations(run).pool(),
+            states=section.audit_episodes,
+            pairs_per_state=0,
+            seed=section.seed,
+            stream="validation",
+            **chosen_by(options),
+        )
+        fixed["suitable"] = chosen.rate.rate
+    by_action = isinstance(reward, LearnedReward) and world.oracle is not None
+    shown_by_expert = (
+        world.demonstrate(SHOWN, seed=section.seed, stream="validation") if by_action else None
+    )
+
+    def audit(step: int) -> dict[str, float]:
+        result = success_rate(policy, env, mode="both", **shown)
+        assert result.sampled is not None
+        paid = return_correlation(policy, reward, waiting, **shown)
+        found = {
+            "success": result.rate.rate,
+            "success_low": result.rate.low,
+            "success_high": result.rate.high,
+            "success_sampled": result.sampled.rate.rate,
+            "success_stopped": result.stopped.rate,
+            "audit_return": float(paid.returns.mean()),
+            "audit_success": paid.success.rate,
+            "reward_auc": paid.auc.value,
+        }
+        if shown_by_expert is not None:
+            demos, truth = shown_by_expert
+            assert isinstance(reward, LearnedReward) and truth is not None
+            found["action_auc"] = reward_audit(reward.reward_model, demos, truth).auc.value
+        return {**found, **fixed}
+
+    return audit
 
 
 @recipe_main
-def main(options: DictConfig) -> None:
-    options = as_made(options)
+def main(options: Options) -> None:
     results = evaluate(options)
     if options.results:
-        keep_result(options, write_result(options, results, "evaluate"))
+        write_result(options, results, "evaluate")
     print(results_table(results))
 
 

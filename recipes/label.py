@@ -1,4 +1,4 @@
-"""Label the demonstrations with the inverse module (paper, 1st-phase)."""
+"""Label the demonstrations with the inverse model (paper, 1st-phase)."""
 
 from typing import Any
 
@@ -6,46 +6,45 @@ from _shared import (
     INVERSE,
     LABELS,
     TRUTH,
+    finish,
     load_demonstrations,
     load_network,
     open_stage,
     shows_progress,
+    world_of,
 )
-from _worlds import open_world
-from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.config import Options
 from ifo_grounding.data import Truth, label_demonstrations
 from ifo_grounding.evaluation import label_accuracy
 from ifo_grounding.report import results_table, text_table
 
 
-def label(options: DictConfig) -> dict:
-    needs = ["record_demonstrations", "train_inverse"]
-    stage = open_stage(options, "label", [], needs)
+def label(options: Options) -> dict:
+    stage = open_stage(options, "label")
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
     inverse = load_network(stage.run, INVERSE, "train_inverse", options)
     _, report = label_demonstrations(demos, inverse, progress=shows_progress(options))
-    stage.replace()
     report.save(stage.run / LABELS)
     found: dict[str, Any] = {"confidence": report.summary()}
     # Only the evaluation reads the truth: nothing of it goes back into training.
-    if (stage.run / TRUTH).exists():  # recorded demonstrations have none
+    if (stage.run / TRUTH).exists():  # demonstrations that were recorded elsewhere have none
         truth = Truth.load(stage.run / TRUTH)
-        accuracy = label_accuracy(report.actions, truth, names=open_world(options).actions)
+        accuracy = label_accuracy(report.actions, truth, names=world_of(options).actions)
         found["accuracy"] = accuracy.as_dict()
-    return stage.finish(found)
+    return finish(options, stage, found)
 
 
 @recipe_main
-def main(options: DictConfig) -> None:
+def main(options: Options) -> None:
     found = label(options)
     if "accuracy" in found:
         print(results_table({"labels": found["accuracy"]}))
     else:
-        names = open_world(options).actions
+        names = world_of(options).actions
         rows = [{**row, "action": names[row["action"]]} for row in found["confidence"]]
         print(text_table(rows, title="confidence of the labels"))
 

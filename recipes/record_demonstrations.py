@@ -1,37 +1,29 @@
 """Record demonstrations, or read what others recorded: frames and instructions, never actions."""
 
-import shutil
-
-from _shared import DEMONSTRATIONS, TRUTH, open_stage, shows_progress, tell
-from _worlds import open_world, read_recorded
-from omegaconf import DictConfig
+from _shared import DEMONSTRATIONS, TRUTH, finish, open_stage, shows_progress, tell, world_of
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.config import Options
 
 
-def record(options: DictConfig) -> dict:
-    decisive = ["demonstrations", *(["recorded"] if options.recorded else [])]
-    stage = open_stage(options, "record_demonstrations", decisive, needs=[])
+def record(options: Options) -> dict:
+    stage = open_stage(options, "record_demonstrations")
     if stage.result is not None:
         return stage.result
+    world, n = world_of(options), options.demonstrations.n
     if options.recorded:
-        demos, truth = read_recorded(options), None
+        demos, truth = world.read(options.recorded, progress=shows_progress(options))[:n], None
     else:
-        demos, truth = open_world(options).demonstrate(
-            options.demonstrations.n, seed=options.seed, progress=shows_progress(options)
-        )
-    stage.replace()
-    demos.save(stage.run / DEMONSTRATIONS)
-    if truth is None:
-        shutil.rmtree(stage.run / TRUTH, ignore_errors=True)  # of others, recorded before
-    else:
+        demos, truth = world.demonstrate(n, seed=options.seed, progress=shows_progress(options))
+    if truth is not None:
         truth.save(stage.run / TRUTH)
+    demos.save(stage.run / DEMONSTRATIONS)
     counts = {"demonstrations": len(demos), "transitions": demos.transitions}
-    return stage.finish({**counts, "instructions": len(demos.pool())})
+    return finish(options, stage, {**counts, "instructions": len(demos.pool())})
 
 
 @recipe_main
-def main(options: DictConfig) -> None:
+def main(options: Options) -> None:
     tell(record(options))
 
 

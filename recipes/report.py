@@ -5,29 +5,27 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _options import as_made
 from _shared import (
     CLASSIFIER,
     GOAL,
+    POLICIES,
     REWARD,
+    chosen_by,
+    evaluation_scenes,
     load_demonstrations,
     load_network,
     open_run,
-    practised_pool,
+    world_of,
 )
-from _worlds import World, open_world
-from evaluate import NAMES, PHASES, evaluate, evaluation_scenes
-from omegaconf import DictConfig
-from tensordict.nn import TensorDictModule
+from evaluate import UNTIL_THE_END, evaluate
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.config import Options
 from ifo_grounding.evaluation import Rate, record_episodes, trace_episode
 from ifo_grounding.files import read_json
 from ifo_grounding.report import (
     animation,
     audit_figure,
-    improved_episodes,
-    instruction_cases,
     reliability_diagram,
     results_rows,
     success_over_iterations,
@@ -41,141 +39,139 @@ from ifo_grounding.training import Run
 CURVES = {
     "imitate": ("Imitation", ["loss_imitation", "accuracy"]),
     "train_instruction": (
-        "Instruction module",
+        "Instruction classifier",
         ["positive_probability", "negative_probability", "removed"],
     ),
-    "train_goal": ("Goal judge", ["final_probability", "unfinished_probability"]),
-    "train_reward": ("Reward module", ["positive_probability", "negative_probability"]),
+    "train_goal": ("Goal classifier", ["final_probability", "unfinished_probability"]),
+    "train_reward": ("Reward model", ["positive_probability", "negative_probability"]),
     "self_examine": (
         "Self-examination",
         ["learned_return", "episode_length", "stopped", "entropy", "served_share", "clip_fraction"],
     ),
 }
 EPISODES, TRACED = 4, 2
+TILE_SIZE = 32
+"""Of a cell in animations, for people."""
 
 
-def report(options: DictConfig, results: dict[str, Any] | None = None) -> Path:
+def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     """Write the page of a run, of what :func:`evaluate` has just returned or will return now."""
     run = open_run(options)
-    if results is None:
-        results = evaluate(options)
-    world = open_world(options)
-    pictures: dict[str, Any] = episode_pictures(run, world, results)
+    results = evaluate(options) if results is None else results
+    pictures: dict[str, Any] = episode_pictures(run, options, results)
     if "suitability" in results:
-        pictures["Chosen instructions"] = instruction_cases(
-            load_network(run, CLASSIFIER, "train_instruction", options),
-            world.task,
-            practised_pool(run, options),
-            threshold=options.instruction.threshold,
-            candidates=options.instruction.candidates,
-            choose=options.instruction.choose,
-            **world.arguments(split=options.evaluate.split, stream="validation"),
+        classifier = load_network(run, CLASSIFIER, "train_instruction", options)
+        oracle = world_of(options).oracle
+        assert oracle is not None
+        pictures["Chosen instructions"] = oracle.instruction_cases(
+            classifier,
+            load_demonstrations(run).pool(),
+            split=options.evaluate.split,
+            stream="validation",
+            **chosen_by(options),
         )
         pictures["How often random pairs are suitable, against what is said"] = reliability_diagram(
             [(said, restored(Rate, rate)) for said, rate in results["suitability"]["reliability"]]
         )
     pictures |= curves(run)
+    section = options.evaluate
+    scenes = section.stream if section.split == "all" else f"{section.stream}, {section.split}"
     return write_report(
         run / "report",
         {"Results": results_rows(results)},
         pictures,
-        title=f"{options.task}, preset {options.network}",
+        title=f"{options.task}, preset {options.preset}",
         summary=f"{options.demonstrations.n:,} demonstrations, seed {options.seed}, "
-        f"{options.evaluate.episodes:,} evaluation scenes ({scenes_of(options)}).",
+        f"{section.episodes:,} evaluation scenes ({scenes}).",
     )
 
 
-def scenes_of(options: DictConfig) -> str:
-    """Return which scenes are evaluated, in words."""
-    stream, split = options.evaluate.stream, options.evaluate.split
-    return stream if split == "all" else f"{stream}, {split} instructions"
+def recorded(policy: Any, scenes: list[int], options: Options, tile_size: int | None) -> list:
+    """Play the evaluation scenes of these numbers, to look at."""
+    where = evaluation_scenes(options)
+    env = world_of(options).instructed(len(scenes), device=options.device, **where)
+    how = {"seed": where["seed"], "stream": where["stream"], "max_steps": UNTIL_THE_END}
+    return record_episodes(policy, env, scenes, render_tile_size=tile_size, **how)
 
 
-def episode_pictures(run: Run, world: World, results: dict[str, Any]) -> dict[str, Any]:
+def episode_pictures(run: Run, options: Options, results: dict[str, Any]) -> dict[str, Any]:
     """Animate episodes: scenes that phase 2 gained and lost, or some of phase 1."""
     found: dict[str, Any] = {}
-    policies = [
-        load_network(run, file, "imitate", world.options)
-        for name, file in NAMES.items()
-        if name in PHASES and name in results
-    ]
-    where = evaluation_scenes(world.options)
-    drawn: dict[str, Any] = {"actions": world.actions}
-    place, shown = world.pictured(list(range(EPISODES)), **where)
-    episodes = record_episodes(policies[-1], place, **shown)
+    names = [name for name in POLICIES if name in results]
+    policies = [load_network(run, POLICIES[name], "imitate", options) for name in names]
+    drawn = {"actions": world_of(options).actions}
+    episodes = recorded(policies[-1], list(range(EPISODES)), options, TILE_SIZE)
     found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES, **drawn)
-    if len(policies) == 1 or results[PHASES[0]]["mode"] != "greedy":
+    if len(policies) == 1 or results[names[0]]["mode"] != "greedy":
         # Actions that were drawn are not drawn again: what they solved, these episodes may not.
-        return found | step_by_step(policies[-1], list(range(TRACED)), run, world)
-    before, after = (torch.from_numpy(unpacked([{"results": results}], p)[0]) for p in PHASES)
-    improved = (after & ~before).nonzero().squeeze(-1)[:TRACED].tolist()
+        return found | step_by_step(policies[-1], list(range(TRACED)), run, options)
+    before, after = (torch.from_numpy(unpacked([{"results": results}], name)[0]) for name in names)
     for title, changed in {
         "Solved by phase 2 alone": after & ~before,
         "Solved by phase 1 alone": before & ~after,
     }.items():
         scenes = changed.nonzero().squeeze(-1)[:EPISODES].tolist()
         if scenes:
-            place, shown = world.pictured(scenes, **where)
-            tries, titles = improved_episodes(policies[0], policies[1], place, **shown)
-            found[title] = animation(tries, titles=titles, columns=len(scenes), **drawn)
-    return found | step_by_step(policies[1], improved or list(range(TRACED)), run, world)
+            tries = [recorded(policy, scenes, options, TILE_SIZE) for policy in policies]
+            titles = [f"phase {phase}" for phase in (1, 2) for _ in scenes]
+            both = [*tries[0], *tries[1]]
+            found[title] = animation(both, titles=titles, columns=len(scenes), **drawn)
+    improved = (after & ~before).nonzero().squeeze(-1)[:TRACED].tolist()
+    return found | step_by_step(policies[1], improved or list(range(TRACED)), run, options)
 
 
 def step_by_step(
-    policy: TensorDictModule, scenes: list[int], run: Run, world: World
+    policy: Any, scenes: list[int], run: Run, options: Options
 ) -> dict[str, bytes]:
-    """Animate episodes with action probabilities, the judges' verdicts and attention."""
-    judges = {
-        name: load_network(run, file, recipe, world.options)
-        for name, file, recipe in (("action", REWARD, "train_reward"), ("goal", GOAL, "train_goal"))
-        if run.is_current(recipe)
+    """Animate episodes with action probabilities, learned rewards and attention."""
+    rewards = {
+        name: load_network(run, file, "two_phase", options)
+        for name, file in (("action", REWARD), ("goal", GOAL))
+        if (run / file).exists()
     }
-    place, shown = world.pictured(scenes, **evaluation_scenes(world.options))
-    words = load_demonstrations(run).vocabulary
-    found = {}
-    for episode in record_episodes(policy, place, **{**shown, "render_tile_size": None}):
-        trace = trace_episode(policy, episode, judges, vocabulary=words)
+    words, found = load_demonstrations(run).vocabulary, {}
+    for episode in recorded(policy, scenes, options, None):
+        trace = trace_episode(policy, episode, rewards, vocabulary=words)
         title = f"Step by step, scene {episode.scene}"
-        found[title] = trace_animation(trace, actions=world.actions)
+        found[title] = trace_animation(trace, actions=world_of(options).actions)
     return found
 
 
-def _known(value: float | None) -> float:
-    """Return what was logged; what was not finite is kept as null."""
-    return math.nan if value is None else value
-
-
 def curves(run: Run) -> dict[str, Any]:
-    """Plot what was logged, stage by stage."""
+    """Plot what was logged, stage by stage; what was not finite was kept as null."""
     found: dict[str, Any] = {}
     for stage, (title, wanted) in CURVES.items():
         path = run / "metrics" / f"{stage}.json"
-        if not path.exists() or not run.is_current(stage):
+        if not path.exists():
             continue
-        history = read_json(path)
-        metrics = {
-            name: ([row["step"] for row in history], [_known(row[name]) for row in history])
-            for name in wanted
-            if all(name in row for row in history)
-        }
-        found[title] = training_curves(metrics)
+        history = [
+            {name: math.nan if value is None else value for name, value in row.items()}
+            for row in read_json(path)
+        ]
+        found[title] = training_curves(
+            {
+                name: ([row["step"] for row in history], [row[name] for row in history])
+                for name in wanted
+                if all(name in row for row in history)
+            }
+        )
         if stage == "self_examine":
             found["Audit of self-examination (validation scenes)"] = audit_figure(history)
         audited = [row for row in history if "success" in row]
         if len(audited) > 1:
-            rates = [
-                Rate(row["success"], row["success_low"], row["success_high"], 0, 0)
-                for row in audited
-            ]
             found["Success in training (validation scenes)"] = success_over_iterations(
-                [row["step"] for row in audited], rates
+                [row["step"] for row in audited],
+                [
+                    Rate(row["success"], row["success_low"], row["success_high"], 0, 0)
+                    for row in audited
+                ],
             )
     return found
 
 
 @recipe_main
-def main(options: DictConfig) -> None:
-    print(report(as_made(options)))
+def main(options: Options) -> None:
+    print(report(options))
 
 
 if __name__ == "__main__":

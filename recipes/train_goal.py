@@ -1,38 +1,32 @@
-"""Train the goal judge: whether an instruction is fulfilled (an extension of the paper)."""
+"""Train the goal classifier: whether an instruction is fulfilled (an extension of the paper)."""
 
-from _learning import train
-from _shared import GOAL, load_demonstrations, open_stage, starting_policy, tell
-from _worlds import build, context_of
-from omegaconf import DictConfig
+from _shared import GOAL, build, learn, load_demonstrations, open_stage, starting_policy, tell
 
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.config import Options
 from ifo_grounding.data import goal_buffer
-from ifo_grounding.networks import make_goal_judge
+from ifo_grounding.networks import make_goal_classifier
 from ifo_grounding.objectives import GoalLoss
 
 
-def train_goal(options: DictConfig) -> dict:
-    needs = ["record_demonstrations", *(["imitate"] if options.goal.init_from_policy else [])]
-    # Runs without near negatives go on as they were before there were any.
-    without = () if options.goal.near else ("goal.near",)
-    stage = open_stage(options, "train_goal", ["goal"], needs, without=without)
+def train_goal(options: Options) -> dict:
+    stage, section = open_stage(options, "train_goal"), options.goal
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
-    policy = starting_policy(stage.run, options, "goal")
-    context = context_of(options, "goal")
+    policy = starting_policy(stage.run, options, section.warm_start)
     loss = GoalLoss(
-        build(make_goal_judge, options, init_from=policy, context=context),
+        build(make_goal_classifier, options, init_from=policy, context=section.context),
         demos.pool(),
-        negatives=options.goal.negatives,
-        removal_rate=options.goal.removal_rate,
-        near=options.goal.near,
+        negatives=section.negatives,
+        removal_rate=section.removal_rate,
+        near=section.near,
     )
-    return train(options, stage, loss, goal_buffer(demos), "goal", GOAL)
+    return learn(options, stage, loss, goal_buffer(demos), section, GOAL)
 
 
 @recipe_main
-def main(options: DictConfig) -> None:
+def main(options: Options) -> None:
     tell(train_goal(options))
 
 

@@ -1,14 +1,18 @@
-"""Both phases on one task, and a report: the main job."""
+"""Both phases on one task, and a report: the main job.
 
-from _options import check
-from _results import write_result
-from _shared import MADE, open_run, plain
+python recipes/two_phase.py task=pick seed=1
+"""
+
+from collections.abc import Callable
+
+from _shared import open_run, write_result
 from collect_transitions import collect
+from controls import continue_imitation
 from evaluate import evaluate
 from imitate import imitate
 from label import label
-from omegaconf import DictConfig
 from record_demonstrations import record
+from references import references
 from self_examine import examine
 from train_goal import train_goal
 from train_instruction import train_instruction
@@ -16,48 +20,43 @@ from train_inverse import train_inverse
 from train_reward import train_reward
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.files import write_json
+from ifo_grounding.config import STAGES, Options
 from ifo_grounding.report import results_table
 from report import report
 
 
-def two_phase(options: DictConfig) -> dict:
-    train_phases(options)
+def two_phase(options: Options) -> dict:
+    last = STAGES.index(options.until or STAGES[-1])
+    for name, stage in stages_of(options).items():
+        if STAGES.index(name) <= last:
+            stage(options)
+    if options.controls.run and last == len(STAGES) - 1:
+        continue_imitation(options)
     results = evaluate(options)
+    if options.references:
+        results = {**results, **references(options)}
     write_result(options, results, "demo")
     return results
 
 
-def train_phases(options: DictConfig) -> None:
-    check(options)  # first, for a new run takes over what its base has made
-    run = open_run(options)
-    if not run.begun:
-        write_json(run / MADE, plain(options))
-    make_phases(options)
-    write_json(run / MADE, plain(options))  # now that all of it was made with these
-
-
-def make_phases(options: DictConfig) -> None:
-    # Phase 1: imitation from observation.
-    record(options)  # first, for they hold the words of worlds with a vocabulary of their own
-    collect(options)
-    train_inverse(options)
-    label(options)
-    imitate(options)
-    if not options.phase2:
-        return
-    # Phase 2: self-examination.
-    train_instruction(options)
-    if options.self_examine.kind != "goal":
-        train_reward(options)
-    if options.self_examine.kind != "action":
-        train_goal(options)
-    if options.practise:
-        examine(options)
+def stages_of(options: Options) -> dict[str, Callable[[Options], dict]]:
+    by_action = options.self_examine.reward == "action"
+    return {
+        # Phase 1: imitation from observation. Demonstrations hold the words of many worlds.
+        "record_demonstrations": record,
+        "collect_transitions": collect,
+        "train_inverse": train_inverse,
+        "label": label,
+        "imitate": imitate,
+        # Phase 2: self-examination.
+        "train_instruction": train_instruction,
+        **({"train_reward": train_reward} if by_action else {"train_goal": train_goal}),
+        "self_examine": examine,
+    }
 
 
 @recipe_main
-def main(options: DictConfig) -> None:
+def main(options: Options) -> None:
     results = two_phase(options)
     page = report(options, results)
     print(f"\n{results_table(results)}\n\nrun: {open_run(options).folder}\nreport: {page}")

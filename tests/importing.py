@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ifo_grounding._folder import recipes_folder
+from ifo_grounding.cli import recipes_folder
 
 
 @contextmanager

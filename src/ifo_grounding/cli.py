@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import inspect
+import os
 import runpy
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
+from pathlib import Path
+from typing import Any
 
-from ifo_grounding import _folder
-from ifo_grounding._folder import recipe_names
-from ifo_grounding._recipes import one_line_errors, recipe_main
 from ifo_grounding.errors import UserError, did_you_mean
 
-__all__ = ["COMMANDS", "main", "recipe_main"]
-
+USAGE_ERROR = 2
+INTERRUPTED = 130
+CLOSED = 141
 COMMANDS = {
     "demo": ("two_phase", "train and compare both phases on one task, then write a report"),
     "evaluate": ("evaluate", "success rate of a trained policy, with its interval"),
@@ -21,6 +25,85 @@ COMMANDS = {
     "report": ("report", "tables, curves and animations of finished runs"),
 }
 """Commands, the recipe behind each, and what it does."""
+
+
+@contextlib.contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Turn a :class:`UserError` into ``error: ...`` on stderr and exit code 2, without a traceback.
+
+    So it does with what the system refuses: a file that cannot be written, a full disk.
+    ``IFO_GROUNDING_TRACEBACK=1`` in the environment keeps the traceback.
+    """
+    try:
+        yield
+    except BrokenPipeError:  # whoever reads what is printed, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(CLOSED) from None
+    except (UserError, OSError) as error:
+        if os.environ.get("IFO_GROUNDING_TRACEBACK") == "1":
+            raise
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        raise SystemExit(USAGE_ERROR) from None
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+
+
+def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
+    """Decorate the function of a recipe script, which takes the options.
+
+    The options are composed by Hydra from ``conf/config.yaml`` and ``name=value`` on the command
+    line, and checked; a recipe with a ``conf/<script name>.yaml`` has options of its own. What is
+    wrong with them, and a :class:`UserError` of the recipe itself, becomes one line on stderr and
+    exit code 2.
+
+    Example of a whole recipe ``recipes/greet.py``::
+
+        @recipe_main
+        def main(options):
+            print("hello", options.task)
+
+        if __name__ == "__main__":
+            main()
+    """
+    script = Path(inspect.getfile(function)).resolve()
+
+    @functools.wraps(function)
+    def main() -> None:
+        with one_line_errors():
+            import hydra
+            from hydra.errors import HydraException
+            from omegaconf import DictConfig, OmegaConf
+            from omegaconf.errors import OmegaConfBaseException
+
+            from ifo_grounding.options import CONFIG, current, explained, help_text
+
+            # Hydra then raises what is wrong instead of printing it; it is explained below.
+            os.environ["HYDRA_FULL_ERROR"] = "1"
+            asked = {"-h", "--help"}.intersection(sys.argv)
+            sys.argv = [each for each in sys.argv if each not in asked]
+            conf = script.parent / "conf"
+            own = (conf / f"{script.stem}.yaml").exists()
+
+            def job(cfg: DictConfig) -> None:
+                if asked:
+                    print(help_text(script.stem, cfg))
+                else:
+                    function(OmegaConf.to_object(cfg) if own else current(cfg))  # type: ignore[arg-type]
+
+            run = hydra.main(
+                version_base=None,
+                config_path=str(conf),
+                config_name=script.stem if own else CONFIG,
+            )
+            try:
+                run(job)()
+            except UserError:
+                raise
+            except (HydraException, OmegaConfBaseException, ValueError) as error:
+                raise explained(error) from None
+
+    return main
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -73,14 +156,32 @@ def resolve(command: str, rest: Sequence[str]) -> tuple[str, list[str]]:
 
 def run_recipe(name: str, options: Sequence[str]) -> None:
     """Run a recipe's script in this process, as ``python recipes/<name>.py <options>`` does."""
-    script = str(_folder.recipes_folder() / f"{name}.py")
+    folder = recipes_folder()
     argv, path = sys.argv, list(sys.path)
-    sys.argv = [script, *options]
-    sys.path.insert(0, str(_folder.recipes_folder()))
+    sys.argv = [str(folder / f"{name}.py"), *options]
+    sys.path.insert(0, str(folder))
     try:
-        runpy.run_path(script, run_name="__main__")
+        runpy.run_path(sys.argv[0], run_name="__main__")
     finally:
         sys.argv, sys.path[:] = argv, path
+
+
+def recipes_folder() -> Path:
+    """Return the folder of the recipes: inside an installed wheel, or beside ``src``.
+
+    >>> (recipes_folder() / "conf" / "config.yaml").is_file()
+    True
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / "recipes", package.parents[1] / "recipes"):
+        if (folder / "conf").is_dir():
+            return folder
+    raise UserError("this installation has no recipes: install ifo-grounding again")
+
+
+def recipe_names() -> list[str]:
+    """Return the names of all recipes, sorted."""
+    return sorted(path.stem for path in recipes_folder().glob("[!_]*.py"))
 
 
 def _unknown(what: str, given: str, allowed: Sequence[str]) -> str:

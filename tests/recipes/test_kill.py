@@ -11,11 +11,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from ifo_grounding._folder import recipes_folder
+from ifo_grounding.cli import recipes_folder
 from ifo_grounding.files import read_json
 
-STAGES = ["collect_transitions", "train_inverse", "record_demonstrations", "label"]
-OPTIONS = ["budget=tiny", "progress=false", "threads=1", "checkpoint_seconds=0"]
+STAGES = ["record_demonstrations", "collect_transitions", "train_inverse", "label"]
+OPTIONS = ["budget=tiny", "demonstrations.n=60", "progress=false", "threads=1", "checkpoint_seconds=0"]
 
 
 def start(name, run, *extra):

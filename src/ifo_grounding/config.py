@@ -1,0 +1,359 @@
+"""Every option of every recipe: a tree of dataclasses, which Hydra checks command lines against.
+
+Below each field stands what it means; ``--help`` and the docs' page of options print that. YAML in
+``recipes/conf`` only chooses values: of presets, budgets and worlds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, OmegaConf, open_dict
+
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.seeding import STREAMS
+from ifo_grounding.training.run import LOGGERS
+from ifo_grounding.training.self_examination import SelfExaminationConfig
+from ifo_grounding.training.supervised import FitConfig
+from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
+
+STAGES = (
+    "record_demonstrations",
+    "collect_transitions",
+    "train_inverse",
+    "label",
+    "imitate",
+    "train_instruction",
+    "train_reward",
+    "train_goal",
+    "self_examine",
+)
+"""Stages of a run, in order."""
+FREE = (
+    *("run", "base", "until", "results", "variant", "to", "hub", "controls.run", "references"),
+    *("device", "threads", "logger", "progress", "checkpoint_seconds", "evaluate"),
+)
+"""Options, or sections of them, that decide nothing of what a run learns: they may be others when
+it goes on."""
+FEW = 1000
+"""With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
+
+
+def within(low: float, high: float, **values: float | None) -> None:
+    """Raise :class:`UserError` unless every value lies within [low, high]; None passes."""
+    for name, value in values.items():
+        if value is not None and not low <= value <= high:
+            allowed = f"at least {low:g}" if high == float("inf") else f"within {low:g}..{high:g}"
+            raise UserError(f"{name} must be {allowed}, got {value:g}")
+
+
+def at_least(low: float, **values: float | None) -> None:
+    """Raise :class:`UserError` unless every value is ``low`` or more; None passes."""
+    within(low, float("inf"), **values)
+
+
+@dataclass
+class DemonstrationsConfig:
+    """What is imitated."""
+
+    n: int = 3000
+    """How many demonstrations are recorded, or read of those in ``recorded``."""
+
+    def __post_init__(self) -> None:
+        at_least(1, n=self.n)
+
+
+@dataclass
+class TransitionsConfig:
+    """Random steps of the simulator, from which the inverse model learns."""
+
+    n: int = 60_000
+    """How many steps."""
+    num_envs: int = 256
+    """Worlds side by side."""
+    stop_probability: float = 0.05
+    """Probability of the stop in a random step."""
+    drop_unchanged: bool = True
+    """Leave out steps other than stops that change nothing: any action could have been theirs."""
+
+    def __post_init__(self) -> None:
+        at_least(1, n=self.n, num_envs=self.num_envs)
+        within(0, 1, stop_probability=self.stop_probability)
+
+
+@dataclass
+class ImitateConfig(FitConfig):
+    """Imitation of the labelled demonstrations: phase 1."""
+
+    held_out: float = 0.0
+    """Share of the demonstrations that is held out; their likelihood decides when to stop."""
+    trials: int = 1
+    """Initial weights that are tried; those that imitate best go on."""
+    trial_steps: int = 300
+    """Steps of each trial."""
+    trial_halvings: int = 0
+    """How often the better half of the trials goes on for as many steps before the best is chosen
+    (successive halving, Jamieson and Talwalkar 2016)."""
+    context: int = 0
+    """How many neighbouring cells away the policy of ``strong`` sees."""
+    words_from: float = 0.0
+    """Share of the steps before which words are neither swapped nor penalised (``strong``)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(1, trials=self.trials, trial_steps=self.trial_steps)
+        at_least(0, trial_halvings=self.trial_halvings, context=self.context)
+        within(0, 1, words_from=self.words_from)
+        within(0, 0.999, held_out=self.held_out)
+
+
+@dataclass
+class InstructionConfig(FitConfig):
+    """The instruction classifier, and how instructions are chosen by it."""
+
+    threshold: float = 0.5
+    """Least probability of being suitable with which an instruction is chosen."""
+    candidates: int = 64
+    """Instructions of the pool that are scored for each state."""
+    choose: str = "random"
+    """Among those above the threshold: ``random``, or the ``best``."""
+    negatives: int = 8
+    """Other instructions that each demonstration is contrasted with."""
+    near: float = 0.0
+    """Share of the negatives that differ from the demonstration's instruction in few words."""
+    contrast: float = 0.0
+    """Weight of telling the own instruction among the negatives (InfoNCE)."""
+    unlabelled: str = "removal"
+    """What is done about false negatives: ``removal``, or taken for a ``mixture``."""
+    removal_rate: float | None = None
+    """Share of the negatives that is taken for suitable; null estimates it."""
+    removal_warmup: float = 0.6
+    """Share of the steps before false negatives are removed."""
+    fresh_states: int = 0
+    """With fewer demonstrations than this, as many states of the simulator are negatives too."""
+    swap_words: bool = False
+    """Whether words are swapped in training (``strong``), for combinations that no demonstration
+    names."""
+    trials: int = 1
+    """Initial weights that are tried; the last trial begins without the policy's roles of words."""
+    trial_steps: int = 300
+    """Steps of each trial."""
+    warm_start: bool = True
+    """Begin with the weights of the phase-1 policy."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("choose", self.choose, ("random", "best"))
+        check_choice("unlabelled", self.unlabelled, ("removal", "mixture"))
+        counts = {"candidates": self.candidates, "negatives": self.negatives}
+        at_least(1, **counts, trials=self.trials, trial_steps=self.trial_steps)
+        at_least(0, contrast=self.contrast, fresh_states=self.fresh_states)
+        within(0, 1, removal_warmup=self.removal_warmup)
+        within(0, 0.999, threshold=self.threshold, near=self.near, removal_rate=self.removal_rate)
+
+
+@dataclass
+class RewardConfig(FitConfig):
+    """The reward model of actions (the paper's)."""
+
+    warm_start: bool = True
+    """Begin with the weights of the phase-1 policy."""
+
+
+@dataclass
+class GoalConfig(FitConfig):
+    """The goal classifier (an extension)."""
+
+    negatives: int = 8
+    """Other instructions that each last frame is scored with."""
+    near: float = 0.0
+    """Share of the negatives that differ from the demonstration's instruction in few words."""
+    removal_rate: float | None = 0.0
+    """Share of the negatives that is taken for fulfilled; null estimates it."""
+    context: int = 0
+    """How many neighbouring cells away the classifier sees."""
+    warm_start: bool = True
+    """Begin with the weights of the phase-1 policy."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        at_least(1, negatives=self.negatives)
+        at_least(0, context=self.context)
+        within(0, 0.999, near=self.near, removal_rate=self.removal_rate)
+
+
+@dataclass
+class SelfExamineConfig(SelfExaminationConfig):
+    """Self-examination: phase 2."""
+
+    reward: str = "goal"
+    """What is paid: ``action``, the paper's reward of every action, or ``goal``, at the stop."""
+    num_envs: int = 256
+    """Worlds side by side."""
+    pairs: int | None = None
+    """Starts, each a scene with a chosen instruction, that are stored and cycled through (5,000 or
+    10,000 in the paper); null chooses instructions for fresh states all the time."""
+    imitation_weight: float = 0.0
+    """Weight of the auxiliary imitation loss."""
+    reward_steps: int = 0
+    """Gradient steps of the reward model in each iteration, with the policy's actions as
+    negatives."""
+    reward_lr: float = 1e-4
+    """Learning rate of these steps."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("reward", self.reward, ("action", "goal"))
+        at_least(1, num_envs=self.num_envs, pairs=self.pairs)
+        at_least(0, imitation_weight=self.imitation_weight, reward_steps=self.reward_steps)
+        if not self.reward_lr > 0:
+            raise UserError(f"reward_lr must be above 0, got {self.reward_lr}")
+
+
+@dataclass
+class EvaluateConfig:
+    """What is measured of a run; nothing of it is learned from."""
+
+    episodes: int = 2000
+    """Scenes in which each policy is played, one episode each."""
+    states: int = 4000
+    """States for which instructions are chosen and checked against the truth; 0 leaves it out."""
+    mode: str = "both"
+    """How the policy acts: ``greedy``, ``sampled`` or ``both``."""
+    stream: str = "evaluation"
+    """Scenes of ``evaluation``, to report, or of ``validation``, to choose by."""
+    split: str = "all"
+    """Instructions of these scenes: ``all``, ``train`` or ``zero-shot``."""
+    seed: int = 0
+    """Of the scenes."""
+    audit_episodes: int = 1000
+    """Episodes in which learned rewards are compared with true success."""
+
+    def __post_init__(self) -> None:
+        check_choice("mode", self.mode, ("greedy", "sampled", "both"))
+        check_choice("stream", self.stream, STREAMS)
+        check_choice("split", self.split, ("all", "train", "zero-shot"))
+        at_least(1, episodes=self.episodes, audit_episodes=self.audit_episodes)
+        at_least(0, states=self.states)
+
+
+@dataclass
+class ControlsConfig:
+    """What phase 2 is compared with: imitation that goes on for as long."""
+
+    run: bool = False
+    """Whether ``demo`` trains the control, too."""
+    lr: float = 1e-3
+    """Its learning rate."""
+
+
+@dataclass
+class NetworksConfig:
+    """Values of :class:`~ifo_grounding.networks.NetworkConfig` for all networks of a run; null
+    leaves the preset's."""
+
+    features: int | None = None
+    """Channels of the feature map."""
+    dropout: float | None = None
+    """Dropout rate before each linear layer of the head."""
+    sentence_rate: float | None = None
+    """How fast the GRU and the gates learn, by the rest (``paper``)."""
+    sentence_pooling: str | None = None
+    """Which states of the GRU make an encoded sentence: ``last``, ``mean`` or ``both``
+    (``paper``)."""
+
+    def changed(self) -> dict[str, Any]:
+        """Return the values that are not the preset's."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass
+class Options:
+    """All options; each recipe reads those that concern it."""
+
+    task: str = MISSING
+    """``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``; of other worlds, a name."""
+    level: str | None = None
+    """Level of BabyAI, with ``world=babyai``."""
+    preset: str = MISSING
+    """Networks and how they learn: ``strong`` (the best that we know) or ``paper``."""
+    budget: str = MISSING
+    """How much data and how many steps: ``tiny``, ``demo``, ``few`` or ``full``."""
+    seed: int = 0
+    """Of all randomness."""
+    device: str = "cpu"
+    """``cpu`` or ``cuda``."""
+    threads: int | None = None
+    """Threads of torch; null leaves torch's choice."""
+    run: str = "${task}-${preset}-${budget}-seed${seed}"
+    """Name of the run's folder under the home folder, or a path."""
+    base: str | None = None
+    """Another run, whose stages up to phase 2 a new run takes over."""
+    recorded: str | None = None
+    """Folder of demonstrations to learn from, in place of recording any."""
+    until: str | None = None
+    """Last stage to do, such as ``imitate`` for phase 1 alone; null does all."""
+    results: str | None = None
+    """Folder for the small file of what was measured."""
+    variant: str | None = None
+    """What is special about the run, for the name of that file."""
+    references: bool = False
+    """Whether ``demo`` also imitates the demonstrator's true actions, to compare with."""
+    to: str = "shared"
+    """Folder to which ``share`` writes the networks."""
+    hub: str | None = None
+    """``user/prefix``: ``share`` also sends them to the Hugging Face Hub."""
+    logger: str = "csv"
+    """``csv``, ``tensorboard``, ``wandb`` or ``none``."""
+    progress: bool = True
+    """Whether to show progress bars."""
+    checkpoint_seconds: float = 15.0
+    """Least time between two checkpoints."""
+    world: Any = MISSING
+    """The world: ``_target_`` names its class, the others are its arguments."""
+    networks: NetworksConfig = field(default_factory=NetworksConfig)
+    demonstrations: DemonstrationsConfig = field(default_factory=DemonstrationsConfig)
+    transitions: TransitionsConfig = field(default_factory=TransitionsConfig)
+    inverse: FitConfig = field(default_factory=FitConfig)
+    imitate: ImitateConfig = field(default_factory=ImitateConfig)
+    instruction: InstructionConfig = field(default_factory=InstructionConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    goal: GoalConfig = field(default_factory=GoalConfig)
+    self_examine: SelfExamineConfig = field(default_factory=SelfExamineConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    controls: ControlsConfig = field(default_factory=ControlsConfig)
+
+    def __post_init__(self) -> None:
+        check_choice("logger", self.logger, LOGGERS)
+        check_choice("until", self.until, (None, *STAGES))
+        within(1, 1024, threads=self.threads)
+        within(0, 86_400, checkpoint_seconds=self.checkpoint_seconds)
+        if not str(self.run).strip(" /"):
+            raise UserError("run needs a name, or the path of a folder")
+        check_device(self.device)
+
+
+def check_device(name: str) -> None:
+    """Raise :class:`UserError` unless networks can be on a device of this name here."""
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = torch.device("meta")
+    if device.type not in ("cpu", "cuda"):
+        raise UserError(f"device={name} is none: use cpu, cuda or cuda:0")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise UserError(f"device={name}: torch sees no GPU here; use device=cpu")
+
+
+def register() -> None:
+    """Register the options, and those of each world, with Hydra."""
+    store = ConfigStore.instance()
+    store.store(name="options", node=Options)
+    for world in (Grid, BabyAI, Gymnasium):
+        node = OmegaConf.structured(world)
+        with open_dict(node):
+            node["_target_"] = f"ifo_grounding.worlds.{world.__name__}"
+        store.store(group="world", name=f"{world.__name__}Options", node=node, package="world")

@@ -1,0 +1,86 @@
+"""Levels of BabyAI (MiniGrid), whose bot demonstrates and whose own reward is success."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from omegaconf import MISSING
+from torch import Tensor
+
+from ifo_grounding.data import Demonstrations, Truth, babyai, bot_outcomes, record_babyai
+from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
+from ifo_grounding.envs import GymnasiumEnv, from_gymnasium
+from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.worlds.base import World
+
+
+@dataclass
+class BabyAI(World):
+    """A level of BabyAI, its whole room seen as a picture; needs the extra ``babyai``."""
+
+    level: str = MISSING
+    """Such as ``GoToObj``, ``GoToLocal`` or ``PickupLoc``."""
+    tile_size: int = 8
+    """Pixels along one side of a cell."""
+    processes: int | None = None
+    """Processes that record the bot side by side; null takes every core."""
+
+    def __post_init__(self) -> None:
+        babyai(self.level, self.tile_size)  # refuses what is no level
+        self.actions, self.stop_action = BABYAI_ACTIONS, DONE
+
+    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> GymnasiumEnv:
+        """Return rooms without missions; see :class:`World`."""
+        return self._rooms(num_envs, seed, "training", "none", device)
+
+    def instructed(
+        self,
+        num_envs: int,
+        *,
+        seed: int,
+        stream: str,
+        split: str = "all",
+        waits: bool = False,
+        device: str = "cpu",
+    ) -> GymnasiumEnv:
+        """Return rooms with their missions, which end with them unless they are to wait."""
+        check_choice("evaluate.split of BabyAI", split, ["all"])
+        return self._rooms(num_envs, seed, stream, "waits" if waits else "ends", device)
+
+    def demonstrate(
+        self, n: int, *, seed: int, stream: str = "training", progress: bool = False
+    ) -> tuple[Demonstrations, Truth | None]:
+        """Let the bot demonstrate, and keep its actions apart."""
+        return record_babyai(
+            self.level,
+            n,
+            keep_truth=True,
+            seed=seed,
+            stream=stream,
+            tile_size=self.tile_size,
+            processes=self.processes or os.cpu_count() or 1,
+            progress=progress,
+        )
+
+    def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
+        """Return the bot's own success."""
+        processes = self.processes or os.cpu_count() or 1
+        return bot_outcomes(self.level, episodes, seed=seed, stream=stream, processes=processes)
+
+    def _rooms(
+        self, num_envs: int, seed: int, stream: str, mission: str, device: str
+    ) -> GymnasiumEnv:
+        if self.vocabulary is None:
+            raise UserError("record demonstrations first: they hold the words of the missions")
+        return from_gymnasium(
+            babyai(self.level, self.tile_size, mission),
+            vocabulary=self.vocabulary,
+            num_envs=num_envs,
+            instructed=mission != "none",
+            stop=self.stop_action,
+            skip_unknown=True,  # no demonstration taught them
+            seed=seed,
+            stream=stream,
+            device=device,
+        )

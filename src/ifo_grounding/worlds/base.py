@@ -1,0 +1,137 @@
+"""What a recipe needs of a world."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.data import Demonstrations, Truth, load_pictures
+from ifo_grounding.data.listing import LIST
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import Endings, SuitabilityResult
+from ifo_grounding.tasks import Vocabulary
+
+
+class Oracle(Protocol):
+    """What knows the truth of a world: for evaluation alone."""
+
+    def suitable_rate(self, classifier: Any, pool: Tensor, **options: Any) -> SuitabilityResult:
+        """Check the instructions that a classifier chooses for fresh states."""
+
+    def endings(self, policy: nn.Module, episodes: int, **scenes: Any) -> Endings:
+        """Say how the policy's episodes end."""
+
+    def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
+        """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
+
+
+class World(ABC):
+    """A world that every recipe runs in.
+
+    A class of one's own gives the simulator and the instructed world; ``demonstrate`` too, if it
+    can make demonstrations, which are otherwise recorded elsewhere (``recorded=FOLDER``). It is
+    chosen by ``world=own world._target_=package.Class``, its arguments by ``+world.NAME=VALUE``.
+
+    Attributes:
+        actions: names of the actions, in their order.
+        stop_action: number of the action by which a policy ends an episode; None without any.
+        vocabulary: the words of instructions; None until the demonstrations tell them, which
+            recipes then set.
+        oracle: what knows the truth; None where nobody does.
+    """
+
+    actions: Sequence[str] = ()
+    stop_action: int | None = None
+    vocabulary: Vocabulary | None = None
+    oracle: Oracle | None = None
+
+    @abstractmethod
+    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> EnvBase:
+        """Return all that a learner may step: worlds without instructions and true rewards.
+
+        Args:
+            num_envs: worlds side by side.
+            seed: of the stream of training scenes.
+            device: where they live.
+
+        Returns:
+            An environment of batch size [num_envs] that shows ``pixels``, uint8 [*B, C, H, W].
+        """
+
+    @abstractmethod
+    def instructed(
+        self,
+        num_envs: int,
+        *,
+        seed: int,
+        stream: str,
+        split: str = "all",
+        waits: bool = False,
+        device: str = "cpu",
+    ) -> EnvBase:
+        """Return worlds with an instruction, which pay success: for evaluation alone.
+
+        Args:
+            num_envs: worlds side by side.
+            seed: of the stream of scenes.
+            stream: ``training``, ``validation`` or ``evaluation``.
+            split: which instructions, where a world knows several splits.
+            waits: whether an episode whose instruction is fulfilled goes on until the policy stops,
+                so that a learned reward at the stop can be compared with success.
+            device: where they live.
+        """
+
+    def demonstrate(
+        self, n: int, *, seed: int, stream: str = "training", progress: bool = False
+    ) -> tuple[Demonstrations, Truth | None]:
+        """Record demonstrations, and apart from them the truth that only evaluation may read.
+
+        Raises:
+            UserError: where the world makes none.
+        """
+        raise UserError(
+            f"{type(self).__name__} makes no demonstrations: give recorded=FOLDER, a folder that "
+            "Demonstrations.save or save_pictures wrote"
+        )
+
+    def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
+        """Return the demonstrator's own success in the scenes of a stream, bool [episodes].
+
+        Raises:
+            UserError: where the world has none.
+        """
+        raise UserError(f"{type(self).__name__} has no demonstrator to compare with")
+
+    def read(self, folder: str | Path, progress: bool = False) -> Demonstrations:
+        """Read demonstrations that were recorded elsewhere.
+
+        Raises:
+            UserError: where there are none, or they show other images than the simulator.
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise UserError(f"recorded={folder} is no folder of demonstrations")
+        if (folder / LIST).exists():
+            demos = load_pictures(folder, vocabulary=self.vocabulary, progress=progress)
+        else:
+            demos = Demonstrations.load(folder).close_episodes()
+        if self.vocabulary is None:
+            self.vocabulary = demos.vocabulary
+        elif demos.vocabulary != self.vocabulary:
+            raise UserError(
+                f"instructions in {folder} have another vocabulary than the world: record them "
+                "with that of the world"
+            )
+        shown = tuple(self.simulator(1, seed=0).observation_spec[keys.PIXELS].shape[1:])
+        if demos.image_shape != shown:
+            raise UserError(
+                f"frames in {folder} are {list(demos.image_shape)}, those of the simulator "
+                f"{list(shown)}: make the world as it was recorded"
+            )
+        return demos

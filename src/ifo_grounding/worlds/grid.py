@@ -1,0 +1,124 @@
+"""The library's own world, in which the paper's five tasks are set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import MISSING
+from torch import Tensor, nn
+
+from ifo_grounding import keys
+from ifo_grounding.data import Demonstrations, Truth, record_demonstrations
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import Endings, SuitabilityResult, episode_endings, suitable_rate
+from ifo_grounding.tasks import VOCABULARY, grammar
+from ifo_grounding.world import Layout
+from ifo_grounding.worlds.base import World
+
+
+@dataclass
+class Grid(World):
+    """Pick and place on a grid of 6x6 cells; its oracle knows what suits a scene.
+
+    >>> Grid("pick").simulator(4, seed=0).batch_size
+    torch.Size([4])
+    """
+
+    task: str = MISSING
+    """``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``."""
+    tile_size: int = 8
+    """Pixels along one side of a cell: 8, 16 or 32."""
+    split: str = "all"
+    """Instructions of training scenes: ``all``, or ``train`` to leave out the pairs of
+    ``holdout``."""
+    holdout: str = "pairs-3"
+    """Colour-shape pairs: ``pairs-1`` to ``pairs-4``, or ``validation-3``."""
+    holdout_visible: bool = True
+    """Whether held-out pairs are still seen in training scenes."""
+    size: int = 6
+    """Cells along one side."""
+    objects: tuple[int, int] = (4, 8)
+    """Fewest and most objects of a scene."""
+    boxes: tuple[int, int] = (2, 4)
+    """Fewest and most boxes of a scene."""
+    inside: float = 0.35
+    """Probability that an object begins in a box."""
+
+    def __post_init__(self) -> None:
+        for name in ("objects", "boxes"):
+            if len(getattr(self, name)) != 2:
+                raise UserError(f"world.{name} is two numbers, got {list(getattr(self, name))}")
+        grammar(self.task)
+        self.layout = Layout(self.size, tuple(self.objects), tuple(self.boxes), self.inside)
+        self.actions, self.stop_action, self.vocabulary = keys.ACTIONS, keys.STOP, VOCABULARY
+        self.oracle = GridOracle(self)
+
+    def scenes(self, **chosen: Any) -> dict[str, Any]:
+        """Return the arguments that environments, recorder and oracle share."""
+        names = ("tile_size", "split", "holdout", "holdout_visible", "layout")
+        return {**{name: getattr(self, name) for name in names}, **chosen}
+
+    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> PickAndPlaceEnv:
+        """Return worlds without instructions and true rewards; see :class:`World`."""
+        options = self.scenes(seed=seed, device=device, instructed=False)
+        return PickAndPlaceEnv(self.task, num_envs, **options)
+
+    def instructed(
+        self,
+        num_envs: int,
+        *,
+        seed: int,
+        stream: str,
+        split: str = "all",
+        waits: bool = False,
+        device: str = "cpu",
+    ) -> PickAndPlaceEnv:
+        """Return worlds with an instruction; a fulfilled one ends no episode."""
+        options = self.scenes(seed=seed, stream=stream, split=split, device=device)
+        return PickAndPlaceEnv(self.task, num_envs, **options)
+
+    def demonstrate(
+        self, n: int, *, seed: int, stream: str = "training", progress: bool = False
+    ) -> tuple[Demonstrations, Truth | None]:
+        """Record the expert."""
+        options = self.scenes(seed=seed, stream=stream, progress=progress)
+        return record_demonstrations(self.task, n, keep_truth=True, **options)
+
+    def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
+        """Return the expert's success: it never fails."""
+        return torch.ones(episodes, dtype=torch.bool)
+
+    def read(self, folder: str | Path, progress: bool = False) -> Demonstrations:
+        """Read demonstrations that were recorded elsewhere, of this task."""
+        demos = super().read(folder, progress)
+        try:
+            grammar(self.task).parse_tokens(demos.pool())
+        except UserError as error:
+            raise UserError(f"{folder} is of another task: {error}; say task=...") from None
+        return demos
+
+
+class GridOracle:
+    """Knows the truth of a :class:`Grid`."""
+
+    def __init__(self, world: Grid) -> None:
+        self.world = world
+
+    def suitable_rate(self, classifier: Any, pool: Tensor, **options: Any) -> SuitabilityResult:
+        """Check the instructions that a classifier chooses for fresh states."""
+        return suitable_rate(classifier, self.world.task, pool, **self.world.scenes(**options))
+
+    def endings(self, policy: nn.Module, episodes: int, **scenes: Any) -> Endings:
+        """Say how the policy's episodes end."""
+        options = self.world.scenes(episodes=episodes, **scenes)
+        return episode_endings(policy, self.world.task, **options)
+
+    def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
+        """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
+        from ifo_grounding.report import instruction_cases  # draws: slow to import
+
+        return instruction_cases(classifier, self.world.task, pool, **self.world.scenes(**options))

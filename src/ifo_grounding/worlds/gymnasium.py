@@ -1,0 +1,96 @@
+"""Any instructed world of Gymnasium; demonstrations come from elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium
+from hydra.utils import get_method
+
+from ifo_grounding.envs import GymnasiumEnv, from_gymnasium
+from ifo_grounding.errors import UserError
+from ifo_grounding.keys import action_names
+from ifo_grounding.worlds.base import World
+
+
+@dataclass
+class Gymnasium(World):
+    """A world of Gymnasium with images, sentences and discrete actions.
+
+    Its instruction is in the observation or in ``info``; an episode has succeeded if its last step
+    pays a reward above 0. The arguments are those of :func:`~ifo_grounding.envs.from_gymnasium`.
+    """
+
+    id: str | None = None
+    """Id for ``gymnasium.make``."""
+    factory: str | None = None
+    """In place of an id: ``package.function`` or ``package.Class`` that makes the world."""
+    make: dict[str, Any] = field(default_factory=dict)
+    """Arguments of ``gymnasium.make`` or of the factory."""
+    image: str | None = "image"
+    """Name of the image in the observation; null where the observation is the image."""
+    instruction: str = "mission"
+    """Name of the sentence in the observation, or else in ``info``."""
+    stop: int | str | None = None
+    """Number of the action by which a policy says that it is done, ``add`` for one more action that
+    never reaches the world, or null without any."""
+    skip_unknown: bool = True
+    """Whether words that no demonstration says are left out of instructions."""
+    names: list[str] | None = None
+    """Names of the actions; numbers by default."""
+
+    def __post_init__(self) -> None:
+        if (self.id is None) == (self.factory is None):
+            raise UserError("name the world by one of world.id=... and world.factory=...")
+        world = self._maker()()
+        count = getattr(world.action_space, "n", 0) + (self.stop == "add")
+        world.close()
+        self.actions = self.names or action_names(int(count))
+        self.stop_action = int(count) - 1 if self.stop == "add" else self.stop
+
+    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> GymnasiumEnv:
+        """Return worlds without instructions and rewards; see :class:`World`."""
+        return self._worlds(num_envs, seed, "training", device, instructed=False)
+
+    def instructed(
+        self,
+        num_envs: int,
+        *,
+        seed: int,
+        stream: str,
+        split: str = "all",
+        waits: bool = False,
+        device: str = "cpu",
+    ) -> GymnasiumEnv:
+        """Return worlds with their instructions, which end as they end."""
+        return self._worlds(num_envs, seed, stream, device, instructed=True)
+
+    def _maker(self) -> Callable[[], gymnasium.Env]:
+        if self.id is not None:
+            return lambda: gymnasium.make(self.id, **self.make)
+        try:
+            factory = get_method(self.factory)
+        except Exception as error:  # whatever the module raises as it is imported
+            raise UserError(f"world.factory={self.factory} cannot be imported: {error}") from None
+        return lambda: factory(**self.make)
+
+    def _worlds(
+        self, num_envs: int, seed: int, stream: str, device: str, instructed: bool
+    ) -> GymnasiumEnv:
+        if self.vocabulary is None:
+            raise UserError("read demonstrations first: they hold the words of instructions")
+        return from_gymnasium(
+            self._maker(),
+            vocabulary=self.vocabulary,
+            num_envs=num_envs,
+            image=self.image,
+            instruction=self.instruction,
+            instructed=instructed,
+            stop=self.stop,
+            skip_unknown=self.skip_unknown,
+            seed=seed,
+            stream=stream,
+            device=device,
+        )

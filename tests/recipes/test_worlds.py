@@ -1,0 +1,212 @@
+"""Every recipe on every world: BabyAI, any of Gymnasium, and a class of one's own."""
+
+import subprocess
+import sys
+
+import pytest
+
+from ifo_grounding import networks
+from ifo_grounding.data import Demonstrations
+from ifo_grounding.errors import UserError
+from ifo_grounding.files import read_json
+from ifo_grounding.options import options_of
+from ifo_grounding.worlds import Grid
+
+TURN = ["goal.context=0", "imitate.context=0", "demonstrations.n=60", "task=dial"]
+DIAL = '''
+"""A world outside the package: a dial with six marks on an image of 20 x 28 pixels."""
+import gymnasium
+import numpy as np
+
+from ifo_grounding.envs import from_gymnasium
+from ifo_grounding.worlds import World
+
+MARKS = ("one", "two", "three", "four", "five", "six")
+
+
+class Dial(gymnasium.Env):
+    observation_space = gymnasium.spaces.Dict({})
+    action_space = gymnasium.spaces.Discrete(3)
+
+    def __init__(self, marks=6):
+        self.marks = marks
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at, self.wanted = self.np_random.choice(self.marks, 2, replace=False)
+        self.steps = 0
+        return self._look(), {}
+
+    def step(self, action):
+        self.steps += 1
+        self.at = int(np.clip(self.at + (-1, 1, 0)[action], 0, self.marks - 1))
+        pressed = action == 2
+        return self._look(), float(pressed and self.at == self.wanted), pressed, self.steps > 12, {}
+
+    def _look(self):
+        view = np.full((20, 28, 3), 30, np.uint8)
+        view[4:16, 2 + 4 * self.at : 5 + 4 * self.at] = (220, 180, 60)
+        return {"view": view, "task": f"turn the dial to {MARKS[self.wanted]}"}
+
+
+class DialWorld(World):
+    def __init__(self, marks=6):
+        self.marks, self.actions, self.stop_action = marks, ("left", "right", "press"), 2
+
+    def simulator(self, num_envs, *, seed, device="cpu"):
+        return self._dials(num_envs, seed, "training", False, device)
+
+    def instructed(self, num_envs, *, seed, stream, split="all", waits=False, device="cpu"):
+        return self._dials(num_envs, seed, stream, True, device)
+
+    def _dials(self, num_envs, seed, stream, instructed, device):
+        return from_gymnasium(
+            lambda: Dial(self.marks), vocabulary=self.vocabulary, num_envs=num_envs, image="view",
+            instruction="task", instructed=instructed, stop=2, seed=seed, stream=stream,
+            device=device,
+        )
+
+
+def demonstrations(n):
+    from ifo_grounding.data import Demonstrations
+
+    shown, said = [], []
+    for seed in range(n):
+        world = Dial()
+        seen, _ = world.reset(seed=seed)
+        frames = [seen["view"]]
+        while world.at != world.wanted:
+            seen, *_ = world.step(int(world.at < world.wanted))
+            frames.append(seen["view"])
+        shown.append(np.stack(frames).transpose(0, 3, 1, 2))
+        said.append(seen["task"])
+    return Demonstrations.from_arrays(shown, said)
+'''
+
+
+@pytest.fixture
+def dial(tmp_path, monkeypatch):
+    """A module ``own_dial`` outside of the package, and a folder of its demonstrations."""
+    (tmp_path / "own_dial.py").write_text(DIAL)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    import own_dial
+
+    own_dial.demonstrations(60).save(tmp_path / "shown")
+    yield f"recorded={tmp_path / 'shown'}"
+    sys.modules.pop("own_dial", None)
+
+
+@pytest.mark.parametrize(
+    "world",
+    [
+        ["world=own", "world._target_=own_dial.DialWorld", "+world.marks=6"],
+        [
+            *("world=gymnasium", "world.factory=own_dial.Dial", "world.image=view"),
+            *("world.instruction=task", "world.stop=2", "world.names=[left,right,press]"),
+        ],
+    ],
+)
+def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
+    from two_phase import two_phase
+
+    from report import report
+
+    given = options(dial, *world, *TURN)
+    results = two_phase(given)
+    assert results["phase2"]["rate"]["count"] == 50
+    assert "goal_return" in results and "suitability" not in results and "labels" not in results
+    policy = networks.load(tmp_path / "run" / "policy-phase2.safetensors")
+    assert policy.network_config.shapes.n_actions == 3
+    assert "dial" in report(given).read_text()
+
+
+@pytest.mark.slow
+def test_a_stage_runs_on_ones_own_world_from_the_command_line(dial, tmp_path):
+    command = [sys.executable, "-m", "ifo_grounding.cli", "demo", dial, "world=own", *TURN]
+    command += ["world._target_=own_dial.DialWorld", "budget=tiny", f"run={tmp_path / 'run'}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "phase 2" in done.stdout and (tmp_path / "run" / "report" / "index.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "refused"),
+    [
+        (["world=own", "world._target_=own_dial.Dial"], "is no ifo_grounding.worlds.World"),
+        (["world=own", "world._target_=nowhere.Dial"], "world._target_=nowhere.Dial cannot be made"),
+        (["world=own", "world._target_=own_dial.DialWorld", "+world.x=1"], "cannot be made with"),
+        (["world=own"], "world._target_"),
+        (["world._target_=own_dial.DialWorld"], "cannot be made with"),
+        (["world=gymnasium"], "one of world.id=... and world.factory=..."),
+        (["world=gymnasium", "world.factory=own_dial.Nothing"], "cannot be imported"),
+        (["world.size=2"], "size must be 3..16"),
+        (["world.objects=[1]"], "world.objects is two numbers"),
+        (["task=mov"], "unknown task 'mov'"),
+        (["world=babyai", "level=GoToMoon"], "there is no level 'BabyAI-GoToMoon-v0'"),
+    ],
+)
+def test_a_world_that_cannot_be_is_refused_first(options, dial, tmp_path, said, refused):
+    from record_demonstrations import record
+
+    with pytest.raises(UserError, match=refused):
+        record(options(dial, *said))
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+def test_a_world_that_makes_no_demonstrations_says_what_to_give(options, dial):
+    from record_demonstrations import record
+
+    with pytest.raises(UserError, match="makes no demonstrations: give recorded=FOLDER"):
+        record(options("world=own", "world._target_=own_dial.DialWorld", *TURN))
+
+
+def test_the_grid_shows_the_same_scenes_as_its_environment():
+    world = Grid("pick", tile_size=16)
+    one, other = (
+        world.instructed(4, seed=3, stream="evaluation").reset()["pixels"] for _ in range(2)
+    )
+    assert one.equal(other) and one.shape == (4, 3, 96, 96)
+    assert "instruction" not in world.simulator(4, seed=3).reset()
+
+
+def test_both_phases_run_in_babyai(options, tmp_path):
+    pytest.importorskip("minigrid")
+    from two_phase import two_phase
+
+    given = options(
+        *("world=babyai", "level=GoToObj", "world.processes=1", "references=true"),
+        *("imitate.lr=1e-4", "self_examine.steps=20", "controls.run=true"),
+        f"results={tmp_path / 'results'}",
+    )
+    results = two_phase(given)
+    names = ("phase1", "phase2", "continued", "true_actions")
+    assert len({results[name]["scenes"] for name in names}) == 1
+    assert all(results[name]["rate"]["count"] == 50 for name in (*names, "demonstrator"))
+    assert results["demonstrator"]["rate"]["rate"] == 1.0
+    assert set(results["labels"]["per_action"]) >= {"left", "forward", "done"}
+    assert "goal_return" in results and "suitability" not in results and "endings" not in results
+    audit = read_json(tmp_path / "run" / "metrics" / "self_examine.json")
+    assert "success" in audit[-1] and "suitable" not in audit[-1]
+    # The words are those of the demonstrations.
+    demos = Demonstrations.load(tmp_path / "run" / "demonstrations")
+    policy = networks.load(tmp_path / "run" / "policy-phase2.safetensors")
+    assert demos.vocabulary.decode(demos.pool()[:1])[0].startswith("go to")
+    assert policy.network_config.shapes.vocabulary_size == len(demos.vocabulary)
+    goal = networks.load(tmp_path / "run" / "goal.safetensors")
+    assert goal.network_config.config.context == 1  # sees what the agent faces
+    [path] = (tmp_path / "results").glob("*.json")
+    assert path.name == "GoToObj-60-strong-seed0.json"
+    # True actions reached the reference alone: phase 1 does without the truth.
+    run = tmp_path / "run"
+    files = ("policy-phase1.safetensors", "reference-true-actions.safetensors")
+    assert (run / files[0]).read_bytes() != (run / files[1]).read_bytes()
+
+
+def test_babyai_knows_no_splits(recipes):
+    pytest.importorskip("minigrid")
+    from _shared import world_of
+
+    world = world_of(options_of("world=babyai"))
+    with pytest.raises(UserError, match="split"):
+        world.instructed(5, seed=0, stream="evaluation", split="zero-shot")

@@ -1,0 +1,160 @@
+"""Typed options: what is refused and how it is said, what a run goes on with, what help tells."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from omegaconf import OmegaConf
+
+from ifo_grounding.cli import recipes_folder
+from ifo_grounding.config import FREE, Options
+from ifo_grounding.data import record_demonstrations
+from ifo_grounding.errors import UserError
+from ifo_grounding.options import CONFIG, described, field_docs, options_of, plain
+from ifo_grounding.training import Run
+
+
+def sections():
+    """Every dataclass of options, by its name in the tree."""
+    found = {"": Options}
+    for field in dataclasses.fields(Options):
+        if dataclasses.is_dataclass(field.default_factory):
+            found[field.name] = field.default_factory
+    return found
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("tsk=move", r"unknown option 'tsk' \(did you mean 'task'\?\): there are "),
+        ("imitate.stps=1", r"unknown option 'imitate.stps' \(did you mean 'steps'\?\): 'imitate'"),
+        ("task.x=1", "task"),
+        ("seed=many", "option seed: value 'many' .* could not be converted to Integer"),
+        ("seed=null", "option seed: field 'seed' is not Optional"),
+        ("imitate.steps=1.5", "option imitate.steps: value '1.5'"),
+        ("imitate.lr=high", "option imitate.lr: value 'high' .* Float"),
+        ("imitate=3", "option imitate: "),
+        ("world.objects=5", "option world.objects"),
+        ("world.nope=1", "unknown option 'world.nope'"),
+        ("preset=huge", "unknown preset 'huge': choose one of paper, strong"),
+        ("preset=film", "unknown preset 'film': choose one of paper, strong"),
+        ("world=moon", "unknown world 'moon': choose one of babyai, grid, gymnasium, own"),
+        ("preset=null", "name=value"),
+        ("=3", "name=value"),
+        ("task=[a", "name=value"),
+        ("+stepz=1", "unknown option 'stepz'"),
+        ("+imitate.stepz=1", "imitate.stepz"),
+        ("~imitate", "option 'imitate' is needed"),
+        ("run={a:1}", "option run"),
+        ("run=/", "run needs a name"),
+        ("task='${nonexistent}'", "nonexistent"),
+        ("imitate.steps=99999999999999999999", "imitate.steps must be at most"),
+        ("imitate.lr=-1", "imitate.lr must be above 0"),
+        ("imitate.lr=nan", "imitate.lr"),
+        ("imitate.batch_size=0", "imitate.batch_size must be at least 1"),
+        ("imitate.held_out=2", "imitate.held_out must be within"),
+        ("imitate.trials=0", "imitate.trials must be at least 1"),
+        ("instruction.threshold=1.5", "instruction.threshold must be within"),
+        ("instruction.unlabelled=foo", "unknown unlabelled 'foo'"),
+        ("goal.removal_rate=few", "option goal.removal_rate"),
+        ("self_examine.algorithm=sac", "unknown algorithm 'sac'"),
+        ("self_examine.reward=both", "unknown reward 'both'"),
+        ("self_examine.pairs=2.5", "option self_examine.pairs"),
+        ("self_examine.reward_lr=0.0", "self_examine.reward_lr must be above 0"),
+        ("self_examine.gamma=2", "self_examine.gamma must be"),
+        ("evaluate.mode=foo", "unknown mode 'foo'"),
+        ("evaluate.episodes=0", "evaluate.episodes must be at least 1"),
+        ("transitions.stop_probability=2", "transitions.stop_probability must be within"),
+        ("demonstrations.n=0", "demonstrations.n must be at least 1"),
+        ("until=imitat", "unknown until 'imitat'"),
+        ("logger=wandbb", "unknown logger"),
+        ("threads=100000", "threads must be within 1..1024"),
+        ("checkpoint_seconds=nan", "checkpoint_seconds"),
+        ("device=gpu", "device=gpu is none: use cpu, cuda or cuda:0"),
+        ("variant=../../x", "variant"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(wrong, said):
+    with pytest.raises(UserError, match=said) as refused:
+        options_of("budget=tiny", wrong)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("world", ["grid", "babyai", "gymnasium"])
+@pytest.mark.parametrize("budget", ["tiny", "demo", "few", "full"])
+@pytest.mark.parametrize("preset", ["strong", "paper"])
+def test_presets_budgets_and_worlds_fit_together(preset, budget, world):
+    options = options_of(f"preset={preset}", f"budget={budget}", f"world={world}")
+    assert (options.preset, options.budget) == (preset, budget)
+    assert options.self_examine.value_warmup < options.self_examine.iterations
+    schedule = "constant" if preset == "paper" else "cosine"
+    assert {getattr(options, s).schedule for s in ("inverse", "imitate", "goal")} == {schedule}
+
+
+def test_few_demonstrations_take_a_budget_of_their_own_unless_one_is_named(tmp_path):
+    def imitate(*said):
+        options = options_of(*said)
+        return options.budget, options.demonstrations.n, options.imitate.batch_size
+
+    assert imitate("demonstrations.n=999") == ("few", 999, 64)
+    assert imitate("demonstrations.n=1000") == ("demo", 1000, 256)
+    assert imitate("demonstrations.n=999", "imitate.batch_size=32") == ("few", 999, 32)
+    assert imitate("demonstrations.n=999", "budget=demo") == ("demo", 999, 256)
+    assert imitate("demonstrations.n=999", "preset=paper") == ("demo", 999, 128)
+    record_demonstrations("move", 40, seed=0).save(tmp_path / "shown")
+    assert imitate(f"recorded={tmp_path / 'shown'}") == ("few", 40, 64)
+
+
+def test_a_run_goes_on_with_its_own_options(tmp_path):
+    run = f"run={tmp_path / 'run'}"
+    made = options_of("preset=paper", "demonstrations.n=100", "seed=3", run)
+    Run(made.run).begin(plain(made), FREE)
+    again = options_of(run, "evaluate.episodes=70", "threads=2")
+    assert (again.preset, again.demonstrations.n, again.seed) == ("paper", 100, 3)
+    assert (again.evaluate.episodes, again.threads) == (70, 2)
+    assert again.imitate == made.imitate
+    for named in ("preset=strong", "demonstrations.n=101", "seed=0", "imitate.lr=0.5"):
+        other = options_of(run, named)
+        with pytest.raises(UserError, match=rf"made with {named.partition('=')[0]}=.*another run="):
+            Run(other.run).begin(plain(other), FREE)
+    same = options_of(run, "seed=3", "preset=paper")
+    Run(same.run).begin(plain(same), FREE)
+
+
+def test_every_option_says_what_it_means():
+    for name, kind in sections().items():
+        docs = field_docs(kind)
+        for field in dataclasses.fields(kind):
+            if name or field.name not in sections():
+                assert docs.get(field.name), f"{name}.{field.name}"
+    assert field_docs(Options)["seed"] == "Of all randomness."
+
+
+def test_every_option_is_read():
+    """Recipes and library name each option somewhere, or nothing would come of it."""
+    package = recipes_folder().parent / "src" / "ifo_grounding"
+    files = [*recipes_folder().glob("*.py"), *package.rglob("*.py")]
+    text = "\n".join(file.read_text() for file in files if file.name != "config.py")
+    for name, kind in sections().items():
+        for field in dataclasses.fields(kind):
+            assert field.name in text, f"{name}.{field.name}"
+
+
+def test_help_lists_values_and_meanings():
+    options = plain(options_of("task=pick", "imitate.steps=7"))
+    lines = list(described(Options, options))
+    assert any(line.split()[:2] == ["task=pick", "`move`,"] for line in lines)
+    assert any(line.split() == ["imitate.steps=7", "Gradient", "steps."] for line in lines)
+    assert any(line.startswith("\nself_examine: Self-examination") for line in lines)
+    assert max(len(line) for line in lines) <= 110
+
+
+def test_the_tree_is_one_that_hydra_checks():
+    """Types are those of a schema: a value of another kind is refused where it is set."""
+    tree = OmegaConf.structured(Options)
+    assert OmegaConf.get_type(tree.imitate).__name__ == "ImitateConfig"
+    assert (recipes_folder() / "conf" / f"{CONFIG}.yaml").exists()
+    for group in ("preset", "budget", "world"):
+        for file in (recipes_folder() / "conf" / group).glob("*.yaml"):
+            assert "# ifo-grounding demo" in file.read_text().splitlines()[1], file.name
