@@ -1,9 +1,13 @@
+import errno
+
 import pytest
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.training import Checkpoint, FitConfig, fingerprint
+from ifo_grounding.training import Checkpoint
 from ifo_grounding.training.checkpoint import spent
+
+SETTINGS = {"lr": 0.1, "seed": 0}
 
 
 @pytest.fixture
@@ -11,16 +15,24 @@ def layer():
     return torch.nn.Linear(3, 2)
 
 
+@pytest.fixture
+def path(tmp_path, layer):
+    """A checkpoint of a layer."""
+    Checkpoint(tmp_path / "run.pt", SETTINGS, layer=layer).save({})
+    return tmp_path / "run.pt"
+
+
 def test_a_checkpoint_restores_every_part_and_the_progress(tmp_path, layer):
     optimizer = torch.optim.Adam(layer.parameters())
     layer(torch.ones(3)).sum().backward()
     optimizer.step()
     path = tmp_path / "run.pt"
-    Checkpoint(path, "same", layer=layer, optimizer=optimizer).save({"iteration": 7})
+    assert Checkpoint(path, SETTINGS, layer=layer).load() is None
+    Checkpoint(path, SETTINGS, layer=layer, optimizer=optimizer).save({"iteration": 7})
 
     other = torch.nn.Linear(3, 2)
     fresh = torch.optim.Adam(other.parameters())
-    progress = Checkpoint(path, "same", layer=other, optimizer=fresh).load()
+    progress = Checkpoint(path, SETTINGS, layer=other, optimizer=fresh).load()
 
     assert progress == {"iteration": 7}
     assert torch.equal(other.weight, layer.weight)
@@ -28,34 +40,24 @@ def test_a_checkpoint_restores_every_part_and_the_progress(tmp_path, layer):
     assert all(moment.abs().sum() > 0 for moment in moments)
 
 
-def test_without_a_file_there_is_nothing_to_continue_from(tmp_path, layer):
-    assert Checkpoint(tmp_path / "none.pt", "a", layer=layer).load() is None
-
-
-def test_a_checkpoint_of_other_settings_is_refused(tmp_path, layer):
-    path = tmp_path / "run.pt"
-    Checkpoint(path, "one", layer=layer).save({})
-    with pytest.raises(UserError, match="other settings"):
-        Checkpoint(path, "two", layer=layer).load()
-
-
-def test_a_checkpoint_of_other_parts_is_refused(tmp_path, layer):
-    path = tmp_path / "run.pt"
-    Checkpoint(path, "a", layer=layer).save({})
-    with pytest.raises(UserError, match="holds layer, here there is guard, layer"):
-        Checkpoint(path, "a", layer=layer, guard=layer).load()
-    with pytest.raises(UserError, match="holds another layer than this run has"):
-        Checkpoint(path, "a", layer=torch.nn.Linear(2, 2)).load()
+def test_a_checkpoint_of_something_else_says_of_what(path, layer):
+    with pytest.raises(UserError, match=r"made with lr=0\.1, not 0\.2"):
+        Checkpoint(path, {**SETTINGS, "lr": 0.2}, layer=layer).load()
+    with pytest.raises(UserError, match="holds layer, here there is layer, value"):
+        Checkpoint(path, SETTINGS, layer=layer, value=layer).load()
+    with pytest.raises(UserError, match="holds another layer than this run has") as error:
+        Checkpoint(path, SETTINGS, layer=torch.nn.Linear(2, 2)).load()
+    assert "\n" not in str(error.value)
 
 
 def test_time_is_counted_from_before_an_interruption(tmp_path, layer, monkeypatch):
     path, clock = tmp_path / "run.pt", [100.0]
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
-    checkpoint = Checkpoint(path, "a", layer=layer)
+    checkpoint = Checkpoint(path, SETTINGS, layer=layer)
     clock[0] = 107.0
     checkpoint.save({})
     clock[0] = 500.0
-    resumed = Checkpoint(path, "a", layer=layer)
+    resumed = Checkpoint(path, SETTINGS, layer=layer)
     resumed.load()
     clock[0] = 503.0
     resumed.save({})
@@ -63,43 +65,53 @@ def test_time_is_counted_from_before_an_interruption(tmp_path, layer, monkeypatc
     assert spent(tmp_path / "none.pt") == 0.0
 
 
+def test_a_flipped_bit_is_noticed_or_changes_nothing(path, layer):
+    """What is between the entries of the archive is read by nobody."""
+    whole, said = path.read_bytes(), []
+    for place in range(0, len(whole), 3):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        other = torch.nn.Linear(3, 2)
+        try:
+            Checkpoint(path, SETTINGS, layer=other).load()
+        except UserError as error:
+            said.append(str(error))
+        else:
+            assert torch.equal(other.weight, layer.weight) and torch.equal(other.bias, layer.bias)
+    assert len(said) > 100
+    assert all("run.pt" in line and "\n" not in line for line in said)
+
+
 @pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])
-def test_a_damaged_checkpoint_is_named(tmp_path, layer, content):
-    path = tmp_path / "run.pt"
-    Checkpoint(path, "a", layer=layer).save({})
+def test_a_damaged_checkpoint_is_named(path, layer, content):
     path.write_bytes(path.read_bytes()[:200] if content is None else content)
-    with pytest.raises(UserError, match=r"run\.pt is damaged"):
-        Checkpoint(path, "a", layer=layer).load()
+    with pytest.raises(UserError, match=r"run\.pt is damaged.*: delete it to start over"):
+        Checkpoint(path, SETTINGS, layer=layer).load()
 
 
-def test_a_foreign_file_is_refused(tmp_path, layer):
-    path = tmp_path / "run.pt"
-    torch.save({"weights": torch.zeros(1)}, path)
-    with pytest.raises(UserError, match="no checkpoint of this library"):
-        Checkpoint(path, "a", layer=layer).load()
-
-
-def test_pickled_code_never_runs(tmp_path, layer):
+def test_a_foreign_file_is_refused_and_runs_no_code(tmp_path, layer):
     class Trap:
         def __reduce__(self):
             return (open, (str(tmp_path / "sprung"), "w"))
 
     path = tmp_path / "run.pt"
-    torch.save({"format": Trap()}, path)
-    with pytest.raises(UserError, match="damaged"):
-        Checkpoint(path, "a", layer=layer).load()
+    for content, error in (({"weights": torch.zeros(1)}, "no checkpoint of"), (Trap(), "damaged")):
+        torch.save(content, path)
+        with pytest.raises(UserError, match=error):
+            Checkpoint(path, SETTINGS, layer=layer).load()
     assert not (tmp_path / "sprung").exists()
 
 
-def test_fingerprints_tell_settings_apart():
-    assert fingerprint(FitConfig(steps=3)) == fingerprint(FitConfig(steps=3))
-    assert fingerprint(FitConfig(steps=3)) != fingerprint(FitConfig(steps=4))
-    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+def test_a_full_disk_is_one_line_and_keeps_the_checkpoint_before(path, layer, monkeypatch):
+    full = OSError(errno.ENOSPC, "No space left on device")
+    before = path.read_bytes()
+    for error in (full, RuntimeError("PytorchStreamWriter failed writing file\nat line 1")):
 
+        def save(content, file, error=error):
+            file.write_bytes(b"half of it")
+            raise error
 
-def test_delete_is_safe_to_repeat(tmp_path, layer):
-    checkpoint = Checkpoint(tmp_path / "run.pt", "a", layer=layer)
-    checkpoint.save({})
-    checkpoint.delete()
-    checkpoint.delete()
-    assert checkpoint.load() is None
+        monkeypatch.setattr(torch, "save", save)
+        with pytest.raises(UserError, match=r"run\.pt cannot be written .* MB are free") as said:
+            Checkpoint(path, SETTINGS, layer=layer).save({})
+        assert "\n" not in str(said.value)
+    assert path.read_bytes() == before and len(list(path.parent.iterdir())) == 1

@@ -1,189 +1,258 @@
 import csv
+import multiprocessing
+import sys
+import types
 
 import pytest
-import torch
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.machine import processor
 from ifo_grounding.training import Checkpoint, Run
 
-
-def test_a_stage_is_done_once_per_settings(tmp_path):
-    run = Run(tmp_path / "run")
-    assert run.stage("train", {"lr": 1}).result is None
-    run.stage("train", {"lr": 1}).finish({"loss": 0.5}, [{"step": 1.0}])
-    assert run.stage("train", {"lr": 1}).result == {"loss": 0.5}
-    assert run.stage("train", {"lr": 2}).result is None
-    assert (tmp_path / "run" / "metrics" / "train.json").exists()
+OPTIONS = {"task": "move", "threads": 1, "imitate": {"steps": 900, "lr": 1e-5, "held_out": None}}
 
 
-def test_a_stage_is_to_be_done_again_when_an_earlier_one_changed(tmp_path):
-    run = Run(tmp_path / "run")
-    run.stage("record", 1).finish({})
-    run.stage("label", "x", needs=["record"]).finish({})
-    assert run.stage("label", "x", needs=["record"]).result == {}
-    run.stage("record", 2).finish({})
-    assert run.stage("label", "x", needs=["record"]).result is None
-
-
-def test_what_was_made_from_an_earlier_stage_that_changed_is_not_current(tmp_path):
-    run = Run(tmp_path / "run")
-    assert not run.is_current("imitate")
-    run.stage("imitate", 1).finish({})
-    run.stage("practise", "x", needs=["imitate", "never"]).finish({})
-    run.stage("report", "y", needs=["practise"]).finish({})
-    assert run.is_current("practise") and run.is_current("report")
-    run.stage("imitate", 2).finish({})
-    assert run.is_current("imitate")
-    assert not run.is_current("practise") and not run.is_current("report")
-
-
-def test_what_is_missing_is_named_with_the_recipe_that_makes_it(tmp_path):
-    with pytest.raises(UserError, match=r"inverse\.safetensors is missing: run the recipe train_"):
-        Run(tmp_path / "run").need("inverse.safetensors", "train_inverse")
-
-
-def test_a_stage_whose_file_is_gone_is_to_be_done_again(tmp_path):
-    run = Run(tmp_path / "run")
-    run.stage("imitate", {}).finish({})
-    (run / "policy").write_text("weights")
-    run.need("policy", "imitate")
-    assert run.stage("imitate", {}).result == {}
-    (run / "policy").unlink()
-    with pytest.raises(UserError, match="run the recipe imitate"):
-        run.need("policy", "imitate")
-    assert run.stage("imitate", {}).result is None
-
-
-def test_a_stage_drops_no_checkpoint_of_one_whose_name_begins_like_its_own(tmp_path):
-    stage = Run(tmp_path / "run").stage("zero-shot", {})
-    for name in ("zero-shot", "zero-shot-3", "zero-shot-jitter", "zero-shot-jitter-0"):
-        Checkpoint(tmp_path / "run" / "checkpoints" / f"{name}.pt", "a").save({})
-    stage.finish({})
-    left = sorted(path.stem for path in (tmp_path / "run" / "checkpoints").iterdir())
-    assert left == ["zero-shot-jitter", "zero-shot-jitter-0"]
-
-
-def test_names_live_under_the_home_folder(tmp_path, monkeypatch):
+def test_names_live_under_the_home_folder_and_paths_where_they_say(tmp_path, monkeypatch):
     monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
     assert Run("mine").folder == tmp_path / "runs" / "mine"
     assert Run(tmp_path / "elsewhere").folder == tmp_path / "elsewhere"
-
-
-def test_metrics_reach_the_csv_logger_once_also_after_a_kill(tmp_path):
-    run = Run(tmp_path / "run")
-    stage = run.stage("train", {})
-    log = stage.log()
-    log({"loss": 3.0}, 10)
-    log({"loss": 2.0}, 20)
-    stage.checkpoint.parent.mkdir(parents=True)
-    stage.checkpoint.touch()  # the run was killed after step 20, its checkpoint is of step 10
-    again = run.stage("train", {}).log()
-    again({"loss": 2.0}, 20)
-    again({"loss": 1.0}, 30)
-    (path,) = (tmp_path / "run" / "logs").rglob("loss.csv")
-    rows = [(int(row[0]), float(row[1])) for row in csv.reader(path.open()) if row]
-    assert rows == [(10, 3.0), (20, 2.0), (30, 1.0)]
-
-
-def test_an_unknown_logger_is_refused(tmp_path):
-    with pytest.raises(UserError, match="unknown logger 'paper'"):
-        Run(tmp_path, logger="paper")
-    assert Run(tmp_path, logger="none").stage("a", {}).log() is None
-
-
-def test_a_run_takes_over_what_another_has_finished(tmp_path):
-    first = Run(tmp_path / "first")
-    first.stage("count", {"to": 3}).finish({"counted": 3})
-    (first / "logs").mkdir()
-    (first / "network.safetensors").write_bytes(b"weights")
-    first.stage("sum", {}).finish({"total": 6})
-    (first / "report").mkdir()
-    (first / "report" / "index.html").write_text("what the first run measured")
-    second = Run(tmp_path / "second")
-    second.take_over(first, without=["sum", "other.safetensors"])
-    assert not (second / "report").exists()
-    assert second.stage("sum", {}).result is None
-    assert second.stage("count", {"to": 3}).result == {"counted": 3}
-    assert second.stage("count", {"to": 4}).result is None
-    assert (second / "network.safetensors").read_bytes() == b"weights"
-    assert not (second / "logs").exists()
-    second.stage("count", {"to": 4}).finish({"counted": 4})
-    second.take_over(first)  # it has begun: nothing is overwritten
-    assert second.stage("count", {"to": 4}).result == {"counted": 4}
-    with pytest.raises(UserError, match="no finished stages"):
-        Run(tmp_path / "third").take_over(Run(tmp_path / "nowhere"))
-    (tmp_path / "empty").mkdir()
-    Run(tmp_path / "empty").take_over(first)
-    assert Run(tmp_path / "empty").begun
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "thesis.tex").touch()
-    with pytest.raises(UserError, match="holds other files"):
-        Run(tmp_path / "other").take_over(first)
-
-
-def test_a_stage_counts_the_time_before_a_kill(tmp_path, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr("time.monotonic", lambda: clock[0])
-    run = Run(tmp_path / "run")
-    stage = run.stage("train", 1)
-    for number, seconds in enumerate((20.0, 5.0)):
-        checkpoint = Checkpoint(stage.checkpoint.with_stem(f"train-{number}"), "a")
-        clock[0] += seconds
-        checkpoint.save({})
-    clock[0] = 1000.0
-    again = Run(tmp_path / "run").stage("train", 1)
-    clock[0] = 1002.0
-    again.finish({})
-    assert run.record("train")["seconds"] == 27.0
-
-
-def test_a_stage_that_is_done_anew_logs_anew(tmp_path):
-    for settings, value in ((1, 0.5), (2, 0.25)):
-        stage = Run(tmp_path / "run").stage("train", settings)
-        stage.log()({"loss": value}, 10)
-        stage.finish({})
-    (file,) = (tmp_path / "run" / "logs" / "train").rglob("*.csv")
-    assert file.read_text().split() == ["10,0.25"]
-
-
-def test_a_checkpoint_of_other_settings_does_not_keep_their_log(tmp_path):
-    for settings, value in ((1, 0.5), (2, 0.25)):
-        stage = Run(tmp_path / "run").stage("train", settings)
-        for step in (10, 20)[: 3 - settings]:
-            stage.log()({"loss": value}, step)
-        stage.checkpoint.parent.mkdir(exist_ok=True)
-        torch.save({}, stage.checkpoint)  # and then it is killed
-    (file,) = (tmp_path / "run" / "logs" / "train").rglob("*.csv")
-    assert file.read_text().split() == ["10,0.25"]
-
-
-def test_a_name_with_a_folder_is_a_path(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     assert Run("./name").folder.resolve() == tmp_path / "name"
     assert Run(".").folder.resolve() == tmp_path
     with pytest.raises(UserError, match="needs a name"):
         Run("")
 
 
-def test_what_is_being_replaced_is_not_taken_for_done(tmp_path):
+def test_a_run_goes_on_with_the_options_that_it_was_made_with(tmp_path):
     run = Run(tmp_path / "run")
-    run.stage("count", {"to": 3}).finish({"counted": 3})
-    run.stage("count", {"to": 4}).replace()  # and killed before it was done
-    assert run.stage("count", {"to": 3}).result is None and not run.is_current("count")
+    assert run.options() is None and not run.begun
+    assert run.begin(OPTIONS) == OPTIONS == run.options()
+    assert run.begun
+    assert run.begin({**OPTIONS, "imitate": {**OPTIONS["imitate"]}}) == OPTIONS
 
 
-def test_an_interrupted_stage_is_known_to_whatever_it_builds_on(tmp_path):
+@pytest.mark.parametrize(
+    ("changed", "free", "error"),
+    [
+        ({"steps": 10}, ["threads"], r"made with imitate\.steps=900, not 10: leave it out"),
+        ({"held_out": 0.1}, [], r"imitate\.held_out=null, not 0\.1: leave it out, or give another"),
+        ({"steps": 10}, ["imitate.step"], r"imitate\.steps=900"),
+        ({"steps": 10}, ["imitate.steps"], None),
+        ({"steps": 10, "lr": 1.0}, ["imitate"], None),
+        ({"new": 3}, [], r"made by another version, without imitate\.new"),
+        ({"new": None}, [], None),
+        ({"new": 3}, ["imitate"], None),
+    ],
+)
+def test_other_options_are_another_run(tmp_path, changed, free, error):
     run = Run(tmp_path / "run")
-    for name, needs in (("label", []), ("imitate", ["label"]), ("judge", []), ("other", [])):
-        run.stage(name, {}, needs).finish({})
-    practice = run.stage("practise", {}, ["imitate", "judge"])
-    practice.begin()
-    assert run.unfinished_on("imitate") is None  # nothing is left of it
-    Checkpoint(practice.checkpoint.with_stem("practise-0"), "a").save({})
-    for name in ("label", "imitate", "judge"):
-        assert run.unfinished_on(name) == "practise"
-    assert run.unfinished_on("other") is None
-    run.stage("imitate", {}, ["label"]).replace()  # as if by hand: it builds on that no more
-    assert run.unfinished_on("label") is None
-    practice.finish({})
-    assert not list((run / "checkpoints").iterdir())
+    run.begin(OPTIONS)
+    asked = {**OPTIONS, "imitate": {**OPTIONS["imitate"], **changed}}
+    if error is None:
+        assert run.begin(asked, free) == asked
+    else:
+        with pytest.raises(UserError, match=error):
+            run.begin(asked, free)
+    assert run.options() == OPTIONS
+
+
+def test_an_option_that_is_gone_is_of_another_version(tmp_path):
+    run = Run(tmp_path / "run")
+    run.begin(OPTIONS)
+    imitate = {"steps": 900, "lr": 1e-5}
+    assert run.begin({**OPTIONS, "imitate": imitate})  # held_out was None
+    with pytest.raises(UserError, match=r"another version, with imitate\.steps"):
+        run.begin({**OPTIONS, "imitate": {"lr": 1e-5}})
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"a: [1", b"- a\n", b"x: ${nothing}\n", b""])
+def test_damaged_options_are_one_line(tmp_path, content):
+    (tmp_path / "config.yaml").write_bytes(content)
+    with pytest.raises(UserError, match=r"config\.yaml is damaged|another version") as error:
+        Run(tmp_path).begin(OPTIONS)
+    assert "\n" not in str(error.value)
+
+
+def test_a_stage_is_done_when_its_record_is_there(tmp_path):
+    run = Run(tmp_path / "run")
+    assert run.stage("train").result is None and run.record("train") == {}
+    assert run.stage("train").finish({"loss": 0.5}, [{"step": 1.0}]) == {"loss": 0.5}
+    assert run.stage("train").result == {"loss": 0.5}
+    assert run.record("train")["machine"] == processor()
+    assert (run / "metrics" / "train.json").exists()
+    run.stage("train").finish({"loss": 0.5}, machine="a GPU")
+    assert run.record("train")["machine"] == "a GPU"
+
+
+def test_checkpoints_go_with_the_stage_that_left_them_alone(tmp_path):
+    run = Run(tmp_path / "run")
+    left = ("imitate", "imitate-0", "imitate-12", "imitate-more", "imitate-more-0")
+
+    def leave():
+        for name in left:
+            Checkpoint(run / "checkpoints" / f"{name}.pt", {}).save({})
+
+    leave()
+    stage = run.stage("imitate")
+    assert stage.checkpoint.stem == "imitate" and stage.trial(12).stem == "imitate-12"
+    stage.finish({})
+    assert sorted(path.stem for path in (run / "checkpoints").iterdir()) == list(left[3:])
+    leave()  # as if the process was killed between the record and the removal
+    run.stage("imitate")
+    assert sorted(path.stem for path in (run / "checkpoints").iterdir()) == list(left[3:])
+
+
+def test_a_stage_counts_the_time_before_a_kill(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    run = Run(tmp_path / "run")
+    for number, seconds in enumerate((20.0, 5.0)):
+        checkpoint = Checkpoint(run.stage("train").trial(number), {})
+        clock[0] += seconds
+        checkpoint.save({})
+    clock[0] = 1000.0
+    again = run.stage("train")
+    clock[0] = 1002.0
+    again.finish({})
+    assert run.record("train")["seconds"] == 27.0
+
+
+def test_what_is_missing_is_named_with_the_recipe_that_makes_it_anew(tmp_path):
+    run = Run(tmp_path / "run")
+    run.stage("imitate").finish({})
+    (run / "policy").write_text("weights")
+    run.need("policy", "imitate")
+    assert run.stage("imitate").result == {}
+    (run / "policy").unlink()
+    with pytest.raises(UserError, match="policy is missing: run the recipe imitate"):
+        run.need("policy", "imitate")
+    assert run.stage("imitate").result is None
+
+
+@pytest.mark.parametrize("logger", ["csv", "tensorboard"])
+def test_metrics_are_logged_once_also_after_a_kill(tmp_path, logger):
+    run = Run(tmp_path / "run", logger)
+    log = run.stage("train").log()
+    log({"loss": 3.0}, 10)
+    log({"loss": 2.0}, 20)
+    log({"reward/loss": 1.0}, 20)
+    again = run.stage("train").log()  # killed after step 20, its checkpoint was of step 10
+    again({"loss": 2.0, "reward/loss": 1.0, "success": 0.5}, 20)
+    again({"loss": 1.0}, 30)
+    del log, again
+    found = {}
+    if logger == "csv":
+        for path in (run / "logs" / "train" / "scalars").rglob("*.csv"):
+            with path.open() as file:
+                found[path.stem, path.parent.name] = [int(row[0]) for row in csv.reader(file)]
+    else:
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+        events = EventAccumulator(str(run / "logs" / "train")).Reload()
+        for key in events.Tags()["scalars"]:
+            *_, group, name = key.split("/")
+            found[name, group] = [event.step for event in events.Scalars(key)]
+    steps = {("loss", "train"): [10, 20, 30], ("loss", "reward"): [20], ("success", "train"): [20]}
+    assert found == steps
+
+
+def test_all_stages_of_a_run_are_one_run_of_wandb(tmp_path, monkeypatch):
+    made = []
+
+    def get_logger(kind, folder, name, **options):
+        made.append((kind, name, options["wandb_kwargs"]["id"]))
+
+    monkeypatch.setitem(sys.modules, "wandb", types.ModuleType("wandb"))
+    sys.modules["wandb"].__spec__ = types.SimpleNamespace()
+    monkeypatch.setattr("torchrl.record.loggers.get_logger", get_logger)
+    for folder in ("one", "one", "other"):
+        Run(tmp_path / folder, "wandb").stage("imitate").log()
+    assert made[0] == made[1] and made[0][:2] == ("wandb", "one")
+    assert made[2][1] == "other" and made[2][2] != made[0][2]
+
+
+def test_an_unknown_logger_is_refused(tmp_path):
+    with pytest.raises(UserError, match="unknown logger 'paper'"):
+        Run(tmp_path, logger="paper")
+    assert Run(tmp_path, logger="none").stage("a").log() is None
+
+
+@pytest.fixture
+def first(tmp_path):
+    """A run of two finished stages."""
+    run = Run(tmp_path / "first")
+    run.begin(OPTIONS)
+    for name in ("imitate", "self_examine"):
+        run.stage(name).finish({"of": name}, [])
+        Checkpoint(run / "checkpoints" / f"{name}.pt", {}).save({})
+    for name in ("logs/a.csv", "report/index.html", "policy.safetensors", ".lock"):
+        (run / name).parent.mkdir(exist_ok=True)
+        (run / name).write_text("of the first run")
+    return run
+
+
+def test_a_run_takes_over_what_another_has_finished(tmp_path, first):
+    second = Run(tmp_path / "second")
+    with second.lock():
+        second.take_over(first, without=["self_examine", "other.safetensors"])
+    taken = {str(path.relative_to(second.folder)) for path in second.folder.rglob("[!.]*.*")}
+    assert taken == {"stages/imitate.json", "metrics/imitate.json", "policy.safetensors"}
+    assert second.begun and second.options() is None
+    second.begin({**OPTIONS, "seed": 1})
+    second.stage("imitate").finish({"of": "second"})
+    second.take_over(first)  # it has begun: nothing is overwritten
+    assert second.stage("imitate").result == {"of": "second"}
+
+
+def test_a_take_over_that_was_killed_goes_on(tmp_path, first, monkeypatch):
+    second, left = Run(tmp_path / "second"), [2]
+    replace = type(tmp_path).replace
+
+    def killed(self, target):
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+        return replace(self, target)
+
+    monkeypatch.setattr(type(tmp_path), "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        second.take_over(first)
+    monkeypatch.undo()
+    second.take_over(first)
+    assert second.stage("self_examine").result == {"of": "self_examine"}
+    assert (second / "policy.safetensors").exists() and not (second / ".taken").exists()
+
+
+def test_only_runs_are_taken_over_into_folders_of_none(tmp_path, first):
+    with pytest.raises(UserError, match="no finished stages"):
+        Run(tmp_path / "third").take_over(Run(tmp_path / "nowhere"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").touch()
+    with pytest.raises(UserError, match="holds other files"):
+        Run(tmp_path / "other").take_over(first)
+
+
+def hold(folder, held, let_go):
+    with Run(folder).lock():
+        held.set()
+        let_go.wait(60)
+
+
+def test_one_process_at_a_time_works_on_a_run(tmp_path):
+    folder = tmp_path / "run"
+    (folder / "stages").mkdir(parents=True)
+    fork = multiprocessing.get_context("fork")
+    held, let_go = fork.Event(), fork.Event()
+    other = fork.Process(target=hold, args=(folder, held, let_go), daemon=True)
+    other.start()
+    assert held.wait(60)
+    (folder / "stages" / ".imitate.json.1a2b3c4d.tmp").touch()  # it is writing it just now
+    with pytest.raises(UserError, match=rf"process {other.pid} on \S+ since 2"), Run(folder).lock():
+        pass
+    assert len(list((folder / "stages").iterdir())) == 1
+    other.kill()
+    other.join()
+    with Run(folder).lock():
+        assert not list((folder / "stages").iterdir())
+        with Run(folder).lock():  # once more by the same process
+            pass

@@ -1,7 +1,7 @@
 """The supervised loop and the self-examination loop that the recipes share."""
 
 from ifo_grounding.training.adversary import Adversary
-from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
+from ifo_grounding.training.checkpoint import Checkpoint
 from ifo_grounding.training.cloning import NothingAcceptedError, accepted, accepted_steps
 from ifo_grounding.training.guard import Guard
 from ifo_grounding.training.held_out import HeldOut
@@ -27,7 +27,6 @@ __all__ = [
     "Stage",
     "accepted",
     "accepted_steps",
-    "fingerprint",
     "fit",
     "load_pairs",
     "save_pairs",

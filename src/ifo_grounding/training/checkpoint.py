@@ -7,11 +7,11 @@ the counters: they are functions of what it holds.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import pickle
+import shutil
 import time
-from dataclasses import asdict, is_dataclass
+import zipfile
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,43 +20,80 @@ import torch
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import atomic_write
 
-FORMAT = "ifo-grounding checkpoint 1"
+FORMAT = "ifo-grounding checkpoint 2"
 
 
-def fingerprint(*settings: Any) -> str:
-    """Return a short hash of settings (dataclasses or JSON values) that decide a run's result.
+def difference(
+    made: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = ()
+) -> str | None:
+    """Return how settings differ from those that something was made with, None where they do not.
 
-    >>> fingerprint({"lr": 0.1}) == fingerprint({"lr": 0.1}), fingerprint(1) == fingerprint(2)
-    (True, False)
+    Args:
+        made: nested settings of before.
+        asked: those of now.
+        free: dotted names, of settings or of whole sections, that may differ. A name that only one
+            side has may be missing on the other where its value is None.
+
+    >>> difference({"imitate": {"steps": 900}}, {"imitate": {"steps": 10}})
+    'made with imitate.steps=900, not 10: leave it out'
+    >>> difference({"imitate": {"steps": 900}}, {"imitate": {"steps": 10}}, free=["imitate"])
     """
-    plain = [asdict(s) if is_dataclass(s) and not isinstance(s, type) else s for s in settings]
-    text = json.dumps(plain, sort_keys=True, default=str)
-    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+    before, now = _leaves(made), _leaves(asked)
+    for name in dict.fromkeys([*before, *now]):
+        if any(name == each or name.startswith(f"{each}.") for each in free):
+            continue
+        there, here = before.get(name), now.get(name)
+        if there == here:
+            continue
+        if name in before and name in now:
+            return f"made with {name}={_written(there)}, not {_written(here)}: leave it out"
+        version = f"with {name}" if name in before else f"without {name}"
+        return f"made by another version, {version}: install that one"
+    return None
+
+
+def _leaves(settings: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """Return all settings that are no sections by their dotted names."""
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            found |= _leaves(value, f"{section}{name}.")
+        else:
+            found[f"{section}{name}"] = list(value) if isinstance(value, tuple) else value
+    return found
+
+
+def _written(value: Any) -> str:
+    """Return a value as it is written on a command line."""
+    return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 class Checkpoint:
-    """One file that holds the state of named parts of a run.
+    """One file that holds the state of named parts of a training loop.
 
     Args:
         path: the file.
-        settings: :func:`fingerprint` of what decides the result; a checkpoint with another
-            fingerprint is refused.
+        settings: what decides the result; a checkpoint of other settings is refused.
         parts: objects with ``state_dict`` and ``load_state_dict``.
 
     >>> import tempfile
     >>> path = Path(tempfile.mkdtemp()) / "checkpoint.pt"
     >>> layer = torch.nn.Linear(2, 1)
-    >>> Checkpoint(path, "a", layer=layer).save({"iteration": 3})
-    >>> Checkpoint(path, "a", layer=torch.nn.Linear(2, 1)).load()
+    >>> Checkpoint(path, {"lr": 0.1}, layer=layer).save({"iteration": 3})
+    >>> Checkpoint(path, {"lr": 0.1}, layer=torch.nn.Linear(2, 1)).load()
     {'iteration': 3}
     """
 
-    def __init__(self, path: str | Path, settings: str, **parts: Any) -> None:
-        self.path, self.settings, self.parts = Path(path), settings, parts
+    def __init__(self, path: str | Path, settings: Mapping[str, Any], **parts: Any) -> None:
+        self.path, self.settings, self.parts = Path(path), dict(settings), parts
         self._begun = time.monotonic()
 
     def save(self, progress: dict[str, Any]) -> None:
-        """Write all parts and ``progress`` (numbers, strings, lists, dicts, tensors)."""
+        """Write all parts and ``progress`` (numbers, strings, lists, dicts, tensors).
+
+        Raises:
+            UserError: where the file cannot be written, such as on a full disk.
+        """
         content = {
             "format": FORMAT,
             "settings": self.settings,
@@ -64,61 +101,66 @@ class Checkpoint:
             "seconds": time.monotonic() - self._begun,
             "parts": {name: part.state_dict() for name, part in self.parts.items()},
         }
-        with atomic_write(self.path) as temporary:
-            torch.save(content, temporary)
+        try:
+            with atomic_write(self.path) as temporary:
+                torch.save(content, temporary)
+        except (OSError, RuntimeError) as error:  # PyTorch's writer raises a RuntimeError
+            free = f"{shutil.disk_usage(self.path.parent).free / 1e6:,.0f} MB are free there"
+            raise UserError(
+                f"{self.path} cannot be written ({_reason(error)}; {free}): make room, and run the "
+                "same again to go on"
+            ) from error
 
     def load(self) -> dict[str, Any] | None:
         """Restore all parts and return the progress, or None where there is no checkpoint.
 
         Raises:
-            UserError: where the file is damaged, foreign, or of a run with other settings or parts.
+            UserError: where the file is damaged, foreign, or of other settings or parts.
         """
         if not self.path.exists():
             return None
         content = _read(self.path)
-        if content["settings"] != self.settings:
-            raise UserError(
-                f"{self.path} belongs to a run with other settings: give this run another name, "
-                "restore the settings, or delete the checkpoint to start over"
-            )
+        over = "or delete it to start over"
+        if found := difference(content["settings"], self.settings):
+            raise UserError(f"{self.path} was {found}, give another path, {over}")
         held, wanted = set(content["parts"]), set(self.parts)
         if held != wanted:
             raise UserError(
                 f"{self.path} holds {', '.join(sorted(held))}, here there is "
-                f"{', '.join(sorted(wanted))}: give this run another name, go on with the same "
-                "parts, or delete the checkpoint to start over"
+                f"{', '.join(sorted(wanted))}: go on with the same parts, {over}"
             )
         for name, part in self.parts.items():
             try:
                 part.load_state_dict(content["parts"][name])
-            except (KeyError, RuntimeError, TypeError, ValueError) as error:
+            except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 raise UserError(
                     f"{self.path} holds another {name} than this run has ({_reason(error)}): give "
-                    "this run another name, or delete the checkpoint to start over"
+                    f"this run another name, {over}"
                 ) from error
-        self._begun = time.monotonic() - content.get("seconds", 0.0)
+        self._begun = time.monotonic() - content["seconds"]
         return content["progress"]
-
-    def delete(self) -> None:
-        """Remove the file, if there is one."""
-        self.path.unlink(missing_ok=True)
 
 
 def spent(path: str | Path) -> float:
     """Return the seconds of work that a checkpoint holds, 0 where it cannot be read."""
     try:
-        return float(_read(Path(path), mmap=True).get("seconds", 0.0))
+        return float(_read(Path(path), whole=False)["seconds"])
     except UserError:  # whoever continues from it says what is wrong
         return 0.0
 
 
-def _read(path: Path, mmap: bool = False) -> dict[str, Any]:
+def _read(path: Path, whole: bool = True) -> dict[str, Any]:
+    """Return what a checkpoint file holds; ``whole`` compares all of it with its checksums."""
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
-    except (RuntimeError, EOFError, OSError, ValueError, pickle.UnpicklingError) as error:
+        if whole:  # PyTorch does not compare them
+            with zipfile.ZipFile(path) as archive:
+                if damaged := archive.testzip():
+                    raise zipfile.BadZipFile(f"the checksum of {damaged} is another")
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=not whole)
+    except Exception as error:  # flipped bits raise whatever the reader stumbles over
         raise UserError(f"{path} is damaged ({_reason(error)}): delete it to start over") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise UserError(f"{path} is no checkpoint of this library: delete it")
+        raise UserError(f"{path} is no checkpoint of this version: delete it to start over")
     return content
 
 

@@ -1,29 +1,38 @@
-"""A run: one folder whose stages are done once, in order, and continue where they were killed."""
+"""A run: one folder, made with one set of options, whose stages are done once and can go on."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import fcntl
 import importlib.util
+import os
+import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+import uuid
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import atomic_write, home, read_json, write_json
-from ifo_grounding.training.checkpoint import fingerprint, spent
+from ifo_grounding.machine import processor
+from ifo_grounding.training.checkpoint import difference, spent
 from ifo_grounding.training.supervised import Log, Metrics
 
 EXTRAS = ("tensorboard", "wandb")
 """Loggers that are packages of their own, and extras of this one."""
-NEEDS = ".needs.json"
-"""How the note of what an unfinished stage builds on is named, after the stage."""
 LOGGERS = ("csv", *EXTRAS, "none")
+OPTIONS = "config.yaml"
+TAKEN = ".taken"
+"""Folder for what is copied from another run, until all of it has its place."""
+NOT_TAKEN = (OPTIONS, "logs", "checkpoints", "report", "result.json", ".*")
+"""What :meth:`Run.take_over` never copies."""
 
 
 class Run:
-    """Folder of a run.
+    """Folder of a run: ``config.yaml``, and what its stages make.
 
     Args:
         name: name of the run under the home folder (see :func:`ifo_grounding.files.home`), or a
@@ -35,13 +44,11 @@ class Run:
 
     >>> import tempfile
     >>> run = Run(tempfile.mkdtemp())
-    >>> stage = run.stage("count", {"to": 3})
-    >>> stage.result is None
-    True
-    >>> stage.finish({"counted": 3})["counted"]
-    3
-    >>> run.stage("count", {"to": 3}).result["counted"]
-    3
+    >>> options = run.begin({"count": {"to": 3}})
+    >>> run.stage("count").finish({"counted": 3})
+    {'counted': 3}
+    >>> run.stage("count").result
+    {'counted': 3}
     """
 
     def __init__(self, name: str | Path, logger: str = "csv") -> None:
@@ -51,11 +58,11 @@ class Run:
                 f"logger={logger} needs the extra of that name: "
                 f"pip install 'ifo-grounding[{logger}]', or use logger=csv"
             )
-        name = str(name)  # options read a name of digits as a number
-        if not name:
+        self.name = str(name)  # options read a name of digits as a number
+        if not self.name:
             raise UserError("a run needs a name, or the path of its folder")
-        given = Path(name).expanduser()
-        is_path = len(given.parts) != 1 or name.startswith((".", "~", "/"))
+        given = Path(self.name).expanduser()
+        is_path = len(given.parts) != 1 or self.name.startswith((".", "~", "/"))
         self.folder = given if is_path else home() / "runs" / given
         self.logger = logger
 
@@ -63,13 +70,101 @@ class Run:
         """Return the path of something in the run's folder."""
         return self.folder / name
 
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes out of the run while the block lasts; the lock dies with this one.
+
+        The process that holds the lock may take it again. Files that a killed process was writing
+        are removed.
+
+        Raises:
+            UserError: where another process holds the lock, with its number, machine and time.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        me = f"process {os.getpid()} on {platform.node()}"
+        with (self / ".lock").open("a+") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                file.truncate(0)
+                print(me, "since", time.strftime("%Y-%m-%d %H:%M:%S"), file=file, flush=True)
+                for stale in [*self.folder.rglob(".*.tmp")]:
+                    shutil.rmtree(stale) if stale.is_dir() else stale.unlink(missing_ok=True)
+            except BlockingIOError:
+                file.seek(0)
+                holder = file.read().strip()
+                if not holder.startswith(f"{me} "):
+                    raise UserError(
+                        f"the run {self.name} is in use by {holder or 'another process'}: wait "
+                        "until it ends, or give another run="
+                    ) from None
+            yield
+
+    def options(self) -> dict[str, Any] | None:
+        """Return the options that the run was made with, None where it has not begun.
+
+        Raises:
+            UserError: where its ``config.yaml`` is damaged.
+        """
+        path = self / OPTIONS
+        if not path.exists():
+            return None
+        from omegaconf import OmegaConf
+        from omegaconf.errors import OmegaConfBaseException
+        from yaml import YAMLError
+
+        try:
+            options = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+        except (OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
+            raise self._damaged(str(error).splitlines()[0]) from None
+        if not isinstance(options, dict):
+            raise self._damaged("it holds no options")
+        return {str(name): value for name, value in options.items()}
+
+    def _damaged(self, why: str) -> UserError:
+        return UserError(f"{self / OPTIONS} is damaged ({why}): restore it, or give another run=")
+
+    def begin(self, options: dict[str, Any], free: Collection[str] = ()) -> dict[str, Any]:
+        """Write the options of a new run, or make sure that a run goes on with those it has.
+
+        Args:
+            options: nested dicts of numbers, strings, booleans, None and lists.
+            free: dotted names, of options or of whole sections, that may differ from before.
+
+        Returns:
+            ``options``.
+
+        Raises:
+            UserError: where the run was made with another value, or its file is damaged.
+        """
+        from omegaconf import OmegaConf
+
+        made = self.options()
+        if made is None:
+            with atomic_write(self / OPTIONS) as temporary:
+                OmegaConf.save(OmegaConf.create(options), temporary)
+        elif found := difference(made, options, free):
+            raise UserError(f"the run {self.name} was {found}, or give another run=")
+        return options
+
+    def stage(self, name: str) -> Stage:
+        """Return a stage of the run."""
+        return Stage(self, name)
+
+    def record(self, name: str) -> dict[str, Any]:
+        """Return what a stage left when it was done, empty where it was not."""
+        path = self._record_path(name)
+        return read_json(path) if path.exists() else {}
+
+    def _record_path(self, name: str) -> Path:
+        return self / f"stages/{name}.json"
+
     def need(self, name: str, recipe: str) -> Path:
         """Return the path of what an earlier recipe made.
 
         Raises:
             UserError: where it is not there, with the recipe that makes it.
         """
-        path = self.folder / name
+        path = self / name
         if not path.exists():
             # Its stage may count as done: to run it again has to help.
             self._record_path(recipe).unlink(missing_ok=True)
@@ -78,15 +173,15 @@ class Run:
 
     @property
     def begun(self) -> bool:
-        """Whether any stage of it was done, or has left a checkpoint."""
-        left = ("stages/*.json", "checkpoints/*.pt")
+        """Whether it has options, or any stage was done or has left a checkpoint."""
+        left = (OPTIONS, "stages/*.json", "checkpoints/*.pt")
         return any(any(self.folder.glob(kind)) for kind in left)
 
     def take_over(self, other: Run, without: Sequence[str] = ()) -> None:
-        """Copy what another run has made, unless this one has begun.
+        """Copy what another run has made, but for its options, unless this one has begun.
 
-        Its finished stages count as done here, as long as their settings are the same. A phase 2
-        can so be repeated with other options, from the same phase 1.
+        What the other run has finished counts as done here. A phase 2 can so be repeated with
+        other options, from the same phase 1.
 
         Args:
             other: the run to copy.
@@ -96,169 +191,125 @@ class Run:
             UserError: where the other run does not exist, or this one's folder holds what is no
                 run's.
         """
-        if self.begun:
-            return
-        self._drop_notes()
-        if self.folder.is_dir() and any(self.folder.iterdir()):
-            raise UserError(f"{self.folder} holds other files and no run: name another run")
-        if not (other.folder / "stages").is_dir():
-            raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
-        anew = [*without, *(f"{name}.json" for name in without)]
-        passing = shutil.ignore_patterns("logs", "checkpoints", "result.json", "report", *anew)
-        copy = self.folder.with_name(f"{self.folder.name}.copying")
-        shutil.rmtree(copy, ignore_errors=True)
-        shutil.copytree(other.folder, copy, ignore=passing)
-        copy.rename(self.folder)
-
-    def _drop_notes(self) -> None:
-        """Forget stages that were begun and left no checkpoint."""
-        checkpoints = self.folder / "checkpoints"
-        for note in checkpoints.glob(f"*{NEEDS}"):
-            note.unlink()
-        if checkpoints.is_dir() and not any(checkpoints.iterdir()):
-            checkpoints.rmdir()
-
-    def stage(self, name: str, settings: Any, needs: Sequence[str] = ()) -> Stage:
-        """Return a stage, done only if its settings and all that it needs are as they were."""
-        earlier = {need: self.record(need).get("settings") for need in needs}
-        return Stage(self, name, fingerprint(settings, earlier), earlier)
-
-    def is_current(self, name: str) -> bool:
-        """Return whether a stage is done, and none that it read from was done anew since."""
-        record = self.record(name)
-        return bool(record) and all(
-            self.record(need).get("settings") == settings
-            and (settings is None or self.is_current(need))
-            for need, settings in record.get("needs", {}).items()
-        )
-
-    def record(self, name: str) -> dict[str, Any]:
-        """Return what a stage left when it was done, empty where it was not."""
-        path = self._record_path(name)
-        return read_json(path) if path.exists() else {}
-
-    def unfinished_on(self, name: str) -> str | None:
-        """Return an interrupted stage that builds on another as that is now, None without any."""
-        for note in sorted((self.folder / "checkpoints").glob(f"*{NEEDS}")):
-            begun = note.name.removesuffix(NEEDS)
-            left = _checkpoints(note.with_name(f"{begun}.pt"))
-            if left and self._builds_on(read_json(note), name):
-                return begun
-        return None
-
-    def _builds_on(self, record: dict[str, Any], name: str) -> bool:
-        """Whether a stage, of this record, was made from what another is now."""
-        needs = record.get("needs", {})
-        return any(
-            settings == self.record(need).get("settings") is not None
-            and (need == name or self._builds_on(self.record(need), name))
-            for need, settings in needs.items()
-        )
-
-    def _record_path(self, name: str) -> Path:
-        return self.folder / "stages" / f"{name}.json"
+        taken = self / TAKEN
+        if not taken.exists():
+            if self.begun:
+                return
+            if any(path for path in self.folder.glob("[!.]*")):
+                raise UserError(f"{self.folder} holds other files and no run: name another run")
+            if not (other / "stages").is_dir():
+                raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
+            anew = [*NOT_TAKEN, *without, *(f"{name}.json" for name in without)]
+            with atomic_write(taken) as temporary:
+                shutil.copytree(other.folder, temporary, ignore=shutil.ignore_patterns(*anew))
+        for entry in [*taken.iterdir()]:  # a killed process may have left some of them to move
+            entry.replace(self / entry.name)
+        taken.rmdir()
 
 
 class Stage:
-    """One step of a run, such as training one network.
+    """One step of a run, such as training one network; done when its record is there.
 
     Attributes:
-        settings: fingerprint of all that decides its result.
         result: what :meth:`finish` was given, or None where the stage is still to be done.
-        continues: whether it was begun before, and left a checkpoint.
         checkpoint: file for its checkpoint.
-        replacing: called by :meth:`replace`, where something is to be noted then.
     """
 
-    def __init__(
-        self, run: Run, name: str, settings: str, needs: Mapping[str, str | None] | None = None
-    ) -> None:
-        self.run, self.name, self.settings, self.needs = run, name, settings, dict(needs or {})
-        record = run.record(name)
-        self.result: dict[str, Any] | None = None
-        if record.get("settings") == settings:
-            self.result = record["result"]
-        self.checkpoint = run.folder / "checkpoints" / f"{name}.pt"
-        left = _checkpoints(self.checkpoint)
-        self.continues = bool(left)
-        self.replacing: Callable[[], None] | None = None
-        self._start = time.monotonic() - (sum(map(spent, left)) if self.result is None else 0.0)
+    def __init__(self, run: Run, name: str) -> None:
+        self.run, self.name = run, name
+        self.checkpoint = run / f"checkpoints/{name}.pt"
+        self.result: dict[str, Any] | None = run.record(name).get("result")
+        if self.result is not None:
+            self._drop_checkpoints()  # of a process that was killed just before it did
+        self._start = time.monotonic() - sum(map(spent, self._checkpoints()))
 
-    @property
-    def _note(self) -> Path:
-        return self.checkpoint.with_suffix(NEEDS)
-
-    def begin(self) -> None:
-        """Note beside its checkpoint what the stage builds on, for as long as it is not done."""
-        write_json(self._note, {"needs": self.needs})
-
-    def replace(self) -> None:
-        """Forget that the stage is done: what was made with other settings is written over now."""
-        self.run._record_path(self.name).unlink(missing_ok=True)
-        if self.replacing is not None:
-            self.replacing()
+    def trial(self, number: int) -> Path:
+        """Return the file for the checkpoint of one of several initial weights."""
+        return self.checkpoint.with_stem(f"{self.name}-{number}")
 
     def finish(
-        self, result: dict[str, Any], history: Sequence[Metrics] | None = None
+        self,
+        result: dict[str, Any],
+        history: Sequence[Metrics] | None = None,
+        machine: str | None = None,
     ) -> dict[str, Any]:
-        """Record that the stage is done, drop its checkpoints, and return ``result``."""
+        """Record that the stage is done, drop its checkpoints, and return ``result``.
+
+        Args:
+            result: what was found, values that JSON can hold.
+            history: metrics of each iteration, for ``metrics/NAME.json``.
+            machine: what computed (see :func:`ifo_grounding.machine.machine_of`); by default this
+                machine's processor.
+        """
         seconds = round(time.monotonic() - self._start, 1)
         if history is not None:
-            write_json(self.run.folder / "metrics" / f"{self.name}.json", list(history))
-        made_of = {"settings": self.settings, "needs": self.needs}
-        record = {**made_of, "result": result, "seconds": seconds}
+            write_json(self.run / f"metrics/{self.name}.json", list(history))
+        record = {"result": result, "seconds": seconds, "machine": machine or processor()}
         write_json(self.run._record_path(self.name), record)
-        for path in (*_checkpoints(self.checkpoint), self._note):
-            path.unlink(missing_ok=True)
+        self._drop_checkpoints()
         self.result = result
         return result
 
     def log(self) -> Log | None:
         """Return a function that sends metrics to the run's TorchRL logger.
 
-        A continued run repeats the steps since its checkpoint exactly. In ``csv`` files those that
-        are logged already are not logged again; other loggers get them twice.
+        A continued run repeats the steps since its checkpoint exactly. In ``csv`` and
+        ``tensorboard`` files those that are logged already are not logged again; ``wandb`` gets
+        them twice, in the one run there that belongs to this folder.
         """
         if self.run.logger == "none":
             return None
         from torchrl.record.loggers import get_logger
 
-        folder = self.run.folder / "logs"
-        goes_on = self.continues
-        if self.run.logger != "wandb":
-            made_of = folder / self.name / "settings"
-            goes_on &= made_of.exists() and made_of.read_text() == self.settings
-            if not goes_on:
-                shutil.rmtree(folder / self.name, ignore_errors=True)  # of other settings
-            with atomic_write(made_of) as temporary:
-                temporary.write_text(self.settings)
-        logged = _last_step(folder / self.name) if goes_on else -1
-        options = (
-            {"wandb_kwargs": {"project": "ifo-grounding"}} if self.run.logger == "wandb" else {}
-        )
-        logger: Any = get_logger(self.run.logger, str(folder), self.name, **options)
+        folder, options, name = self.run / "logs", {}, self.name
+        if self.run.logger == "wandb":
+            options = {"wandb_kwargs": {"project": "ifo-grounding", "id": _wandb_id(folder)}}
+            name = self.run.folder.resolve().name
+        logged = _last_steps(folder / self.name, self.run.logger)
+        logger: Any = get_logger(self.run.logger, str(folder), name, **options)
 
         def log(metrics: Metrics, step: int) -> None:
-            if step > logged:
-                for key, value in metrics.items():
-                    logger.log_scalar(f"{self.name}/{key}", value, step=step)
+            for key, value in metrics.items():
+                if step > logged.get(full := f"{self.name}/{key}", -1):
+                    logger.log_scalar(full, value, step=step)
+            if self.run.logger == "tensorboard":
+                logger.experiment.flush()  # before the checkpoint that these steps are in
 
         return log
 
+    def _checkpoints(self) -> list[Path]:
+        """Return its checkpoint and those of its trials, as far as they are there."""
+        trials = self.checkpoint.parent.glob(f"{self.name}-*.pt")
+        numbered = [path for path in trials if path.stem[len(self.name) + 1 :].isdigit()]
+        return [path for path in (self.checkpoint, *sorted(numbered)) if path.exists()]
 
-def _checkpoints(path: Path) -> list[Path]:
-    """Return a checkpoint, if it is there, and those named after it with a dash and a number."""
-    beside = (
-        other
-        for other in path.parent.glob(f"{path.stem}-*.pt")
-        if other.stem[len(path.stem) + 1 :].isdigit()
-    )
-    return [*([path] if path.exists() else []), *sorted(beside)]
+    def _drop_checkpoints(self) -> None:
+        for path in self._checkpoints():
+            path.unlink(missing_ok=True)
 
 
-def _last_step(folder: Path) -> int:
-    last = -1
-    for path in folder.rglob("*.csv"):
-        with path.open(newline="") as file:
-            last = max([last, *(int(float(row[0])) for row in csv.reader(file) if row)])
+def _wandb_id(folder: Path) -> str:
+    """Return by which id Weights and Biases goes on with a run, drawn once per folder."""
+    path = folder / "wandb-id"
+    if not path.exists():
+        with atomic_write(path) as temporary:
+            temporary.write_text(uuid.uuid4().hex[:8])
+    return path.read_text()
+
+
+def _last_steps(folder: Path, logger: str) -> Mapping[str, int]:
+    """Return the last step that a stage has logged of each metric, from the files in ``folder``."""
+    last: dict[str, int] = {}
+    if logger == "csv":
+        scalars = folder / "scalars"
+        for path in scalars.rglob("*.csv"):
+            with path.open(newline="") as file:
+                steps = [int(float(row[0])) for row in csv.reader(file) if row]
+            last[str(path.relative_to(scalars).with_suffix(""))] = max(steps, default=-1)
+    elif logger == "tensorboard" and folder.is_dir():
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+        events = EventAccumulator(str(folder), size_guidance={"scalars": 1}).Reload()
+        for key in events.Tags()["scalars"]:
+            last[key] = events.Scalars(key)[-1].step
     return last

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.errors import UserError, at_least_one, check_choice, check_numbers
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.adversary import Adversary
-from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
+from ifo_grounding.training.checkpoint import Checkpoint
 from ifo_grounding.training.environment import (
     check_env,
     fixes_scenes,
@@ -131,7 +131,6 @@ def self_examine(
     log: Log | None = None,
     callback: Callback | None = None,
     progress: bool = False,
-    settings: Any = None,
 ) -> list[Metrics]:
     """Improve ``policy`` in place by policy gradient on learned rewards.
 
@@ -152,7 +151,6 @@ def self_examine(
         log: gets the metrics of each iteration.
         callback: gets the iteration, returns further metrics; the place for audits.
         progress: whether to show a progress bar.
-        settings: what else decides the result; a checkpoint made with other settings is refused.
 
     Returns:
         Metrics of each iteration.
@@ -195,8 +193,8 @@ def self_examine(
         for place, transform in enumerate(transforms_of(env))
         if fixes_scenes(transform)
     }
-    identity = fingerprint(config, seed, list(env.batch_size), settings)
-    saved = Checkpoint(checkpoint, identity, **parts) if checkpoint else None
+    settings = {**asdict(config), "seed": seed, "worlds": env.batch_size.numel()}
+    saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
     history: list[Metrics] = state["history"]
     if not state["iteration"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,7 +19,7 @@ from ifo_grounding.modules import beside, device_of
 from ifo_grounding.networks.transfer import inherited
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.captured import CapturedUpdate, Update, let_capture, set_rate
-from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
+from ifo_grounding.training.checkpoint import Checkpoint
 
 Metrics = dict[str, float]
 Callback = Callable[[int], Metrics]
@@ -158,7 +158,6 @@ def fit(
     callback: Callback | None = None,
     held_out: Validation | None = None,
     progress: bool = False,
-    settings: Any = None,
     until: int | None = None,
     cudagraph: bool = False,
 ) -> list[Metrics]:
@@ -181,7 +180,6 @@ def fit(
         held_out: measures the loss on held-out samples (``held_out_loss``), or the learned return
             (``selection_return``); the weights that did best there are kept in the end.
         progress: whether to show a progress bar.
-        settings: what else decides the result; a checkpoint made with other settings is refused.
         until: steps after which to pause, rounded up to whole iterations; a later call with the
             same checkpoint goes on. None learns to the end.
         cudagraph: whether a GPU may be told of a step once and repeat it, where the loss is
@@ -214,7 +212,7 @@ def fit(
         parts |= {"held_out": held_out} if held_out else {}
         if sampler is not None and not isinstance(sampler, RandomSampler):
             parts["sampler"] = sampler  # where it is in its round
-        saved = Checkpoint(checkpoint, fingerprint(config, seed, name, settings), **parts)
+        saved = Checkpoint(checkpoint, {**asdict(config), "seed": seed, "name": name}, **parts)
     state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
     same_steps = getattr(loss, "capturable", False) and not decay
     same_sizes = isinstance(sampler, RandomSampler)
