@@ -10,8 +10,8 @@ from _worlds import Grid, open_world
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from ifo_grounding.episodes import MODES
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.evaluation.episodes import MODES
 from ifo_grounding.networks import NetworkConfig
 from ifo_grounding.networks.config import KINDS as NETWORKS
 from ifo_grounding.objectives.instruction import UNLABELLED
