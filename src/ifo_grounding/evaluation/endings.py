@@ -14,16 +14,9 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.episodes import Outcomes, Policy, play
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation.episodes import (
-    MAX_STEPS,
-    Outcomes,
-    Policy,
-    device_of,
-    play,
-    play_scenes,
-    scene_batches,
-)
+from ifo_grounding.evaluation.scenes import MAX_STEPS, device_of, play_scenes, scene_batches
 from ifo_grounding.tasks.goals import SIDES, Goal, Plan
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.world import SHAPES, WorldState, kind_name, neighbour

@@ -14,7 +14,7 @@ from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.endings import looks
-from ifo_grounding.evaluation.episodes import device_of
+from ifo_grounding.evaluation.scenes import device_of
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import GroundedTrunk, attention_maps
 from ifo_grounding.networks.transfer import trunk_of

@@ -15,15 +15,9 @@ from torchrl.envs import EnvBase
 from ifo_grounding import keys
 from ifo_grounding.attributes import answers
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.episodes import Policy, play
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation.episodes import (
-    Policy,
-    device_of,
-    most_steps,
-    play,
-    scene_batches,
-    seeded,
-)
+from ifo_grounding.evaluation.scenes import device_of, most_steps, scene_batches, seeded
 from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary

@@ -14,16 +14,10 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth
+from ifo_grounding.episodes import Policy, play
 from ifo_grounding.errors import UserError, at_least_one
-from ifo_grounding.evaluation.episodes import (
-    Policy,
-    device_of,
-    most_steps,
-    play,
-    scene_batches,
-    seeded,
-)
 from ifo_grounding.evaluation.labels import actions_of
+from ifo_grounding.evaluation.scenes import device_of, most_steps, scene_batches, seeded
 from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.stats import Estimate, Rate, auc, correlation, wilson

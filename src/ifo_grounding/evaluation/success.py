@@ -11,17 +11,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ifo_grounding.episodes import MODES, Outcomes, Policy, play
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.evaluation.episodes import (
-    MODES,
-    Outcomes,
-    Policy,
-    device_of,
-    most_steps,
-    play,
-    play_scenes,
-    scene_batches,
-)
+from ifo_grounding.evaluation.scenes import device_of, most_steps, play_scenes, scene_batches
 from ifo_grounding.stats import Difference, Rate, paired_difference, wilson
 
 

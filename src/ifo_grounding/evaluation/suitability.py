@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, whole
-from ifo_grounding.evaluation.episodes import MAX_STEPS, device_of
+from ifo_grounding.evaluation.scenes import MAX_STEPS, device_of
 from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Estimate, Rate, auc, reliability, wilson
 from ifo_grounding.tasks.goals import REASONS, Goal, verdict

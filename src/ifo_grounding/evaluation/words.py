@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation.episodes import device_of
+from ifo_grounding.evaluation.scenes import device_of
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import GroundedTrunk
 from ifo_grounding.networks.transfer import trunk_of

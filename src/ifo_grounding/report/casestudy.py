@@ -13,8 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation.episodes import Policy
 from ifo_grounding.evaluation.recording import Episode, record_episodes
 from ifo_grounding.evaluation.success import SuccessResult
 from ifo_grounding.evaluation.suitability import NOT_SERVED, judged_choices, read_pool

@@ -11,12 +11,11 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ifo_grounding import keys
+from ifo_grounding.episodes import play
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
-from ifo_grounding.stepping import actions_of, following
 from ifo_grounding.training.environment import (
     fixes_scenes,
     reseed,
@@ -43,28 +42,17 @@ def learned_returns(env: EnvBase, policy: nn.Module, episodes: int, max_steps: i
     Returns:
         Learned return of each episode, float32 [episodes].
     """
-    batches = math.ceil(episodes / env.batch_size.numel())
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        return torch.cat([_batch_returns(env, policy, max_steps) for _ in range(batches)])[
-            :episodes
-        ]
-
-
-def _batch_returns(env: EnvBase, policy: nn.Module, max_steps: int) -> Tensor:
-    state: TensorDictBase = env.reset()
     rows = env.batch_size.numel()
-    total = torch.zeros(rows)
-    active = torch.arange(rows, device=state["done"].device)
-    for _ in range(max_steps):
-        state[env.action_key] = actions_of(policy, env, state, active)
-        stepped = env.step(state)
-        after = stepped[keys.NEXT].reshape(rows)[active]
-        total[active.cpu()] += after[keys.LEARNED_REWARD].reshape(-1).cpu()
-        active = active[~after["done"].reshape(-1)]
-        if not len(active):
-            break
-        state = following(env, stepped)
-    return total
+    found = []
+    for _ in range(math.ceil(episodes / rows)):
+        total = torch.zeros(rows, device=env.device)
+
+        def add(running: Tensor, transition: TensorDictBase, total: Tensor = total) -> None:
+            total[running] += transition[keys.NEXT, keys.LEARNED_REWARD].reshape(-1)
+
+        play(policy, env, env.reset(), max_steps=max_steps, on_step=add)
+        found.append(total.cpu())
+    return torch.cat(found)[:episodes]
 
 
 class BestPolicy:

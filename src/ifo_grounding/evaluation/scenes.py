@@ -1,45 +1,27 @@
-"""Playing one episode per fixed scene."""
+"""Scenes by number, their hash, and one episode of each."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ifo_grounding import keys, modules
 from ifo_grounding.attributes import answers
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
+from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
-from ifo_grounding.stepping import Policy, actions_of, following
 
 MAX_STEPS = 40
 MAX_STEPS_OF_OTHERS = 1000
 """Most actions in an environment that is given, whose episodes end by themselves mostly."""
-MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
-"""How actions are chosen: the likeliest, or drawn from the policy's distribution."""
-
-OnStep = Callable[[Tensor, TensorDictBase], None]
-"""Told, after each step, the rows still running, int64 [R], and their transitions, [R]."""
-
-
-class Outcomes(NamedTuple):
-    """How episodes ended."""
-
-    success: Tensor
-    """Whether the instruction was fulfilled at the end, bool [N]."""
-    lengths: Tensor
-    """Actions taken, the stop included, int64 [N]."""
-    stopped: Tensor
-    """Whether the episode terminated, before the limit of its length: in a world that ends by
-    itself, not only by the policy's stop. Bool [N]."""
 
 
 def device_of(module: object) -> torch.device:
@@ -54,75 +36,6 @@ def seeded(seed: int, device: torch.device) -> Iterator[None]:
     with torch.random.fork_rng(devices=cuda):
         torch.manual_seed(seed)
         yield
-
-
-def play(
-    policy: Policy,
-    env: EnvBase,
-    start: TensorDictBase,
-    *,
-    mode: str = "greedy",
-    max_steps: int = MAX_STEPS,
-    on_step: OnStep | None = None,
-) -> Outcomes:
-    """Play every row's episode to its end, once.
-
-    The policy is asked for the rows still running only. What rows do after their episode is
-    ignored; an episode that has not ended after ``max_steps`` counts as a failure.
-
-    Args:
-        policy: writes an action; put it into eval mode yourself (:func:`evaluating`).
-        env: a batched environment, just reset.
-        start: what its reset returned.
-        mode: ``greedy`` or ``sampled``.
-        max_steps: most actions per episode.
-        on_step: called after each step with the rows that took it and their transitions.
-
-    Returns:
-        Outcomes of all rows [N], N the number of rows of the env.
-    """
-    check_choice("mode", mode, MODES)
-    rows = env.batch_size.numel()
-    on = {"device": start.device or env.device}
-    success = torch.zeros(rows, dtype=torch.bool, **on)
-    lengths = torch.zeros(rows, dtype=torch.int64, **on)
-    stopped = torch.zeros(rows, dtype=torch.bool, **on)
-    active = torch.arange(rows, **on)
-    state, reward_key = start, true_reward_key(env)
-    with set_exploration_type(MODES[mode]):
-        for _ in range(max_steps):
-            state[env.action_key] = actions_of(policy, env, state, active)
-            stepped = env.step(state)
-            transition = stepped.reshape(rows)[active]
-            after = transition[keys.NEXT]
-            ended = after["done"].reshape(-1)
-            lengths[active] += 1
-            success[active] = ended & (after[reward_key].reshape(-1) > 0)
-            by_itself = after.get("terminated", after["done"])
-            stopped[active] = ended & by_itself.reshape(-1)
-            if on_step is not None:
-                on_step(active, transition)
-            active = active[~ended]
-            if not len(active):
-                break
-            state = following(env, stepped)
-    return Outcomes(success, lengths, stopped)
-
-
-def true_reward_key(env: EnvBase) -> NestedKey:
-    """Return the key of an environment's true reward, which may have learned ones beside it.
-
-    Raises:
-        UserError: where there are several, and none is called ``reward``.
-    """
-    found = env.reward_keys
-    if len(found) == 1:
-        return found[0]
-    if keys.REWARD in found:
-        return keys.REWARD
-    raise UserError(
-        f"the environment pays {found}: success is seen from the true reward, named {keys.REWARD!r}"
-    )
 
 
 def most_steps(env_or_task: EnvBase | str, max_steps: int | None) -> int:
@@ -277,6 +190,11 @@ def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
         raise UserError(
             f"success needs an environment that shows its image under {keys.PIXELS!r}: rename its "
             "entry with torchrl.envs.RenameTransform"
+        )
+    if len(env.reward_keys) > 1 and keys.REWARD not in env.reward_keys:
+        raise UserError(
+            f"the environment pays {env.reward_keys}: success is seen from the true reward, named "
+            f"{keys.REWARD!r}"
         )
 
 
