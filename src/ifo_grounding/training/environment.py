@@ -30,7 +30,7 @@ def check_env(env: EnvBase) -> None:
         raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
     written = [*env.full_reward_spec.keys(True, True), *observed]
     if keys.LEARNED_REWARD not in written:
-        raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
+        raise UserError("the env pays no learned reward: add LearnedReward or GoalReward")
 
 
 def make_collector(env: EnvBase, policy: nn.Module, steps: int) -> Collector:
