@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import RandomPolicy
 
 from ifo_grounding import keys
-from ifo_grounding.attributes import answers
+from ifo_grounding.attributes import attribute
 from ifo_grounding.errors import UserError
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -75,5 +75,4 @@ def following(env: EnvBase, stepped: TensorDictBase) -> TensorDictBase:
     Those that may be stepped on are, which spares new scenes for rows that nobody looks at.
     """
     state = env.step_mdp(stepped)
-    told = answers(env, STEPS_ON)
-    return state if told and all(told) else env.maybe_reset(state)
+    return state if attribute(env, STEPS_ON) else env.maybe_reset(state)
