@@ -259,7 +259,7 @@ def test_a_stop_may_be_any_whole_number(stop):
 def test_who_does_not_say_which_action_is_the_stop_is_asked():
     env = make_env()
     env.stop_action = "press"
-    with pytest.raises(UserError, match="stop_action is 'press': it is the number of an action"):
+    with pytest.raises(UserError, match="stop_action must be a whole number, got 'press'"):
         collect_transitions(env, 10)
     silent = CounterWorld((4,))
     with pytest.raises(UserError, match="does not say which action is its stop"):

@@ -17,7 +17,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, return_correlation, success_rate
 from ifo_grounding.networks import make_policy
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
-from ifo_grounding.transforms import InstructionSampler, LearnedReward
+from ifo_grounding.transforms import GoalReward, InstructionSampler
 
 WORDS = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS], length=6)
 DIAL = {"vocabulary": WORDS, "image": "view", "instruction": "task"}
@@ -194,7 +194,7 @@ def test_episodes_are_recorded_and_judged_as_they_are_counted():
         return 16.0 * (shown(pixels) == wanted(td)).float().unsqueeze(-1) - 8.0
 
     judge = TensorDictModule(at_the_mark, ["pixels", "instruction"], ["goal_score"])
-    reward = LearnedReward(judge, "goal", stop_action=PRESS)
+    reward = GoalReward(judge, stop_action=PRESS)
     audit = return_correlation(half, reward, dials(7), episodes=14, mode="greedy")
     assert torch.equal(audit.outcomes, result.outcomes) and audit.auc.value == 1.0
 
@@ -297,11 +297,9 @@ def test_it_says_which_action_is_the_stop(stop, named):
     assert (report.kept[PRESS] > 0) == (named == PRESS)
 
     judge = TensorDictModule(lambda pixels: torch.ones(len(pixels), 1), ["pixels"], ["goal_score"])
-    paid = TransformedEnv(env, LearnedReward(judge, "goal"))
     if stop is None:
-        with pytest.raises(UserError, match="does not say which action is the stop"):
-            paid.rollout(2)
         return
+    paid = TransformedEnv(env, GoalReward(judge, stop_action=env.stop_action))
     rollout = paid.rollout(20, break_when_any_done=False)
     stopped = rollout["action"] == named
     assert stopped.any() and torch.equal(rollout["next", "learned_reward"][..., 0] > 0, stopped)
@@ -316,7 +314,7 @@ def test_arrival_is_paid_where_nobody_stops():
         return 8.0 * (shown(pixels) == four).float().unsqueeze(-1) - 4.0
 
     judge = TensorDictModule(there, ["pixels"], ["goal_score"])
-    paid = TransformedEnv(env, LearnedReward(judge, "goal", arrival=0.9))
+    paid = TransformedEnv(env, GoalReward(judge, stop_action=None, arrival=0.9))
     check_env_specs(paid)
     rollout = paid.rollout(60, break_when_any_done=False)
     after = rollout["next"]

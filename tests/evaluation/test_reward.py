@@ -15,7 +15,7 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import return_correlation, reward_audit
 from ifo_grounding.networks import make_goal_judge, make_policy, make_reward_model
-from ifo_grounding.transforms import LearnedReward
+from ifo_grounding.transforms import GoalReward, LearnedReward
 
 
 @pytest.fixture(scope="module")
@@ -122,16 +122,12 @@ def test_return_is_the_sum_of_what_is_paid(make_expert):
     assert math.isnan(mean.correlation.value) and mean.auc.value == 0.5
     discounted = return_correlation(policy, half, "move", discount=0.5, **options)
     assert torch.allclose(discounted.returns, 1 - 0.5**lengths)
-    centred = return_correlation(policy, LearnedReward(half, form="centred"), "move", **options)
-    assert torch.equal(centred.returns, torch.zeros(60))
 
 
 def test_a_reward_that_pays_for_failure(make_expert):
     policy, _ = half_expert(make_expert)
-    moves_cost = judge_of_actions(lambda action: torch.where(action == 5, 0.0, -50.0))
-    audit = return_correlation(
-        policy, LearnedReward(moves_cost, form="log-odds"), "move", episodes=40, expose_state=True
-    )
+    stops = LearnedReward(judge_of_actions(lambda action: torch.where(action == 5, 0.0, -50.0)))
+    audit = return_correlation(policy, stops, "move", episodes=40, average=True, expose_state=True)
     assert audit.correlation.value < -0.7 and audit.auc.value == 0.0
     assert audit.success.rate == 0.5
     assert json.loads(json.dumps(audit.as_dict(), allow_nan=False))["auc"]["value"] == 0.0
@@ -142,7 +138,7 @@ def test_real_models_of_both_kinds(recorded):
     policy = make_policy(demos, "paper", seed=0)
     for pay in (
         make_reward_model(demos, "paper", seed=0),
-        LearnedReward(make_goal_judge(demos, "paper", seed=0), kind="goal"),
+        GoalReward(make_goal_judge(demos, "paper", seed=0), stop_action=5),
     ):
         audit = return_correlation(policy, pay, "move", episodes=100)
         assert torch.isfinite(audit.returns).all() and (audit.returns >= 0).all()
@@ -154,7 +150,7 @@ def test_worlds_in_workers_are_judged(recorded):
     policy, judge = make_policy(demos, "paper", seed=0), make_goal_judge(demos, "paper", seed=0)
     worlds = SerialEnv(3, lambda: PickAndPlaceEnv("move", num_envs=2, seed=0))
     audit = return_correlation(
-        policy, LearnedReward(judge, kind="goal", stop_action=5), worlds, episodes=8, max_steps=10
+        policy, GoalReward(judge, stop_action=5), worlds, episodes=8, max_steps=10
     )
     assert audit.success.count == 8 and torch.isfinite(audit.returns).all()
 
@@ -168,7 +164,7 @@ def test_a_goal_judge_is_shown_the_first_and_the_last_frame(make_expert):
         ["goal_score"],
     )
     audit = return_correlation(
-        policy, LearnedReward(judge, kind="goal"), "move", episodes=40, expose_state=True
+        policy, GoalReward(judge, stop_action=5), "move", episodes=40, expose_state=True
     )
     assert torch.allclose(audit.returns, audit.outcomes.float(), atol=1e-6)
     assert audit.correlation.value == pytest.approx(1.0)
@@ -185,6 +181,6 @@ def test_arrival_is_paid_once():
     def up(td):
         return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
 
-    pay = LearnedReward(judge, kind="goal", arrival=0.9)
+    pay = GoalReward(judge, stop_action=None, arrival=0.9)
     audit = return_correlation(up, pay, "move", episodes=40, max_steps=5)
     assert set(audit.returns.round(decimals=5).tolist()) == {0.0, 1.0}

@@ -15,7 +15,7 @@ from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.networks import make_goal_judge, make_policy, make_reward_model
 from ifo_grounding.report import trace_animation
 from ifo_grounding.tasks import VOCABULARY
-from ifo_grounding.transforms import LearnedReward
+from ifo_grounding.transforms import GoalReward, LearnedReward
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_judges_say_what_the_learned_reward_pays(env):
     stopped = played.clone()
     stopped[keys.ACTION] = torch.full((steps,), keys.STOP)
     stopped[keys.NEXT, keys.PIXELS] = stopped[keys.PIXELS]
-    goal = LearnedReward(judges["goal"], "goal", stop_action=keys.STOP)
+    goal = GoalReward(judges["goal"], stop_action=keys.STOP)
     paid = goal(stopped)[keys.NEXT, keys.LEARNED_REWARD]
     np.testing.assert_allclose(trace.rewards["goal"], paid.flatten(), rtol=1e-4)
 

@@ -44,7 +44,7 @@ from ifo_grounding.objectives import (
 )
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit, self_examine
-from ifo_grounding.transforms import InstructionSampler, LearnedReward
+from ifo_grounding.transforms import GoalReward, InstructionSampler, LearnedReward
 
 FOLDER = Path(__file__).parent
 PRESETS = ("paper", "strong")
@@ -145,7 +145,7 @@ def phases(preset):
     if preset == "paper":
         reward = LearnedReward(make_reward_model(demos, preset, seed=0, dropout=0.0))
     else:
-        reward = LearnedReward(make_goal_judge(demos, preset, seed=0), "goal", stop_action=5)
+        reward = GoalReward(make_goal_judge(demos, preset, seed=0), stop_action=5)
     config = SelfExaminationConfig(
         algorithm="reinforce" if preset == "paper" else "ppo",
         iterations=3,

@@ -14,7 +14,7 @@ from torchrl.data import (
 )
 from torchrl.envs import ParallelEnv, RenameTransform, SerialEnv, StepCounter, TransformedEnv
 
-from ifo_grounding.attributes import stop_of
+from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import Shapes, make_inverse, make_policy
@@ -131,7 +131,7 @@ def test_workers_in_processes_are_asked(wrap):
     worker = partial(PickAndPlaceEnv, "move", num_envs=2, instructed=False)
     workers = wrap(ParallelEnv(3, worker, mp_start_method="fork"))  # none is started
     assert Shapes.of(workers) == Shapes.of(worker())
-    assert stop_of(workers, "a test") == 5
+    assert attribute(workers, "stop_action") == 5
 
 
 def test_one_hot_actions_are_refused():

@@ -9,7 +9,7 @@ from ifo_grounding.networks import make_goal_judge, make_instruction_classifier,
 from ifo_grounding.seeding import derive
 from ifo_grounding.training import accepted, accepted_steps
 from ifo_grounding.training.environment import make_collector, reseed
-from ifo_grounding.transforms import InstructionSampler, LearnedReward
+from ifo_grounding.transforms import GoalReward, InstructionSampler
 
 
 def test_episodes_are_accepted_by_their_own_return():
@@ -26,7 +26,7 @@ def practice(bias):
     judge.module.prior.fill_(bias)  # accepts everything, or nothing
     pool = torch.randint(1, 20, (4, 16))
     sampler = InstructionSampler(classifier, pool, threshold=0.0)
-    env = TransformedEnv(simulator, Compose(sampler, LearnedReward(judge, "goal")))
+    env = TransformedEnv(simulator, Compose(sampler, GoalReward(judge, stop_action=5)))
     return env, make_policy(simulator, **small)
 
 
@@ -56,7 +56,7 @@ def test_worlds_in_workers_are_as_those_side_by_side():
     classifier = make_instruction_classifier(world(0), features=16, n_blocks=1, seed=0)
     sampler = InstructionSampler(classifier, torch.randint(1, 20, (4, 16)), threshold=0.0)
     workers = SerialEnv(2, [lambda: world(0), lambda: world(1)])
-    env = TransformedEnv(workers, Compose(sampler, LearnedReward(judge, "goal", stop_action=5)))
+    env = TransformedEnv(workers, Compose(sampler, GoalReward(judge, stop_action=5)))
     steps = accepted_steps(env, policy, iterations=1, steps=10, seed=0)
 
     batches = iter(make_collector(env, policy, 10))

@@ -1,4 +1,4 @@
-"""A small foreign world with pixels, and judges of it that can be computed by hand.
+"""A small foreign world with pixels, and models of it that can be computed by hand.
 
 Each row shows a number from 0 to 9 as its brightness. Actions: 0 adds one, 1 takes one away, 2
 stops. The instruction [t, 0, 0, 0] asks to reach t - 1; it is suitable where the number shown is
@@ -12,7 +12,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from ifo_grounding.transforms import InstructionSampler
 
 STOP = 2
 LENGTH = 4
@@ -137,7 +139,7 @@ class Suitability(nn.Module):
 
 
 class Whole(nn.Module):
-    """The same judge without the two halves."""
+    """The same classifier without the two halves."""
 
     def __init__(self, network):
         super().__init__()
@@ -147,7 +149,7 @@ class Whole(nn.Module):
         return self.network(pixels, instruction)
 
 
-class ActionJudge(nn.Module):
+class RewardModel(nn.Module):
     """Logit 2 for going up below the target and for stopping at it, else -1."""
 
     def __init__(self):
@@ -161,7 +163,7 @@ class ActionJudge(nn.Module):
         return self.dropout(torch.where(wanted == action, self.right, -1.0)).unsqueeze(-1)
 
 
-class GoalJudge(nn.Module):
+class GoalClassifier(nn.Module):
     """Logit 4 where the target is shown now and was not at first, else -4."""
 
     def __init__(self):
@@ -181,12 +183,23 @@ def classifier(nested=False, whole=False):
     return TensorDictModule(Whole(network) if whole else network, keys, ["suitability"])
 
 
-def action_judge(nested=False):
+def reward_model(nested=False):
     keys = [("agent", "pixels"), ("agent", "instruction")] if nested else ["pixels", "instruction"]
-    return TensorDictModule(ActionJudge(), [*keys, "action"], ["action_score"])
+    return TensorDictModule(RewardModel(), [*keys, "action"], ["action_score"])
 
 
-def goal_judge(nested=False):
+def goal_classifier(nested=False):
     names = ["initial_pixels", "pixels", "instruction"]
     keys = [("agent", name) for name in names] if nested else names
-    return TensorDictModule(GoalJudge(), keys, ["goal_score"])
+    return TensorDictModule(GoalClassifier(), keys, ["goal_score"])
+
+
+def make(*rewards, batch=(6,), world=None):
+    """Return the world with chosen instructions and rewards."""
+    sampler = InstructionSampler(classifier(), POOL)
+    return TransformedEnv(world or CounterWorld(batch, max_steps=12), Compose(sampler, *rewards))
+
+
+def expert(tensordict):
+    gap = tensordict["instruction"][..., 0] - 1 - shown(tensordict["pixels"])
+    return tensordict.set("action", torch.where(gap > 0, 0, torch.where(gap < 0, 1, STOP)))

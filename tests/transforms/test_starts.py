@@ -12,7 +12,7 @@ from torchrl.envs import Compose, StepCounter, TransformedEnv
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.transforms import LearnedReward, StartingPairs, frame_hash
-from transforms.counter_world import CounterWorld, action_judge
+from transforms.counter_world import CounterWorld, reward_model
 
 
 def make_pairs(count=7, length=4):
@@ -89,7 +89,7 @@ def test_state_dict_resumes_the_order():
 
 
 def test_composes_with_other_transforms():
-    transforms = Compose(StepCounter(), StartingPairs(make_pairs()), LearnedReward(action_judge()))
+    transforms = Compose(StepCounter(), StartingPairs(make_pairs()), LearnedReward(reward_model()))
     env = TransformedEnv(CounterWorld((3,)), transforms)
     rollout = env.rollout(30, break_when_any_done=False)
     assert rollout["next", "learned_reward"].shape == (3, 30, 1)

@@ -17,11 +17,11 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ifo_grounding import keys
-from ifo_grounding.attributes import STOP_ACTION, attribute, says_stop
+from ifo_grounding.attributes import attribute
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import DAMAGED, fact, load_folder, save_folder
-from ifo_grounding.errors import UserError, at_least_one
+from ifo_grounding.errors import UserError, at_least_one, whole
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
@@ -63,8 +63,8 @@ class RandomActions(TensorDictModuleBase):
         self.in_keys: list[Any] = []
         self.out_keys = [env.action_key]
         self.shape, self.n_actions, self.device = spec.shape, int(spec.space.n), env.device
-        named = attribute(env, STOP_ACTION) if stop_action is None else stop_action
-        self.stop_action: int | None = named
+        named = attribute(env, "stop_action") if stop_action is None else stop_action
+        self.stop_action = None if named is None else whole("stop_action", named)
         if self.stop_action is not None and not 0 <= self.stop_action < self.n_actions:
             raise UserError(f"stop_action must be 0..{self.n_actions - 1}, got {stop_action}")
         self.probabilities = torch.full((self.n_actions,), 1 / self.n_actions)
@@ -222,10 +222,10 @@ def collect_transitions(
     (64, True)
     """
     n = at_least_one("n", n)
-    if drop_unchanged and stop_action is None and not says_stop(env):
+    if drop_unchanged and stop_action is None and attribute(env, "stop_action", ...) is ...:
         raise UserError(
             "the environment does not say which action is its stop, whose unchanged frames are "
-            f"kept: give stop_action=, set its {STOP_ACTION} (None where no action is), or say "
+            "kept: give stop_action=, set its stop_action (None where no action is), or say "
             "drop_unchanged=False"
         )
     policy = RandomActions(env, stop_probability, stop_action, seed)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.attributes import answers
+from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.episodes import Policy, play
 from ifo_grounding.errors import UserError
@@ -99,7 +99,7 @@ def record_episodes(
 
     frames = [[frame] for frame in look(start)]
     actions: list[list[int]] = [[] for _ in scenes]
-    vocabulary: Vocabulary = next(filter(None, answers(env, "vocabulary")), VOCABULARY)
+    vocabulary: Vocabulary = attribute(env, "vocabulary", VOCABULARY)
     told = start.reshape(len(scenes))[keys.INSTRUCTION]
     sentences = vocabulary.decode(told.cpu())
 

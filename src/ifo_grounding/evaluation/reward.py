@@ -21,7 +21,7 @@ from ifo_grounding.evaluation.scenes import device_of, most_steps, scene_batches
 from ifo_grounding.modules import evaluating
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.stats import Estimate, Rate, auc, correlation, wilson
-from ifo_grounding.transforms import LearnedReward
+from ifo_grounding.transforms import GoalReward, LearnedReward
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class ReturnAudit:
 
 def return_correlation(
     policy: Policy,
-    reward: TensorDictModuleBase | LearnedReward,
+    reward: TensorDictModuleBase | LearnedReward | GoalReward,
     env_or_task: EnvBase | str,
     *,
     episodes: int = 1000,
@@ -204,8 +204,9 @@ def return_correlation(
 
     Args:
         policy: whose episodes; sampled by default, so that some succeed and some fail.
-        reward: what pays: a :class:`~ifo_grounding.transforms.LearnedReward`, or a module from
-            (pixels, instruction, action) to a logit, taken as ``LearnedReward(reward)``.
+        reward: a :class:`~ifo_grounding.transforms.LearnedReward`, a
+            :class:`~ifo_grounding.transforms.GoalReward`, or a module from (pixels, instruction,
+            action) to a logit, taken as ``LearnedReward(reward)``.
         env_or_task: name of a task, or an instructed batched environment with a true reward.
         episodes: number of scenes.
         seed: of scenes and actions.
@@ -219,7 +220,7 @@ def return_correlation(
             40 for a task's name, and 1,000 in an environment, whose own limit may be lower.
         env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
     """
-    pay = reward if isinstance(reward, LearnedReward) else LearnedReward(reward)
+    pay = reward if isinstance(reward, LearnedReward | GoalReward) else LearnedReward(reward)
     where = torch.device(device) if device is not None else device_of(policy)
     limit = most_steps(env_or_task, max_steps)
     batches = scene_batches(
@@ -242,9 +243,7 @@ def return_correlation(
                 start,
                 mode=mode,
                 max_steps=limit,
-                on_step=_purse(
-                    pay.ask(env), start.reshape(-1)[keys.PIXELS].clone(), total, discount
-                ),
+                on_step=_purse(pay, start.reshape(-1)[keys.PIXELS].clone(), total, discount),
             )
         if average:
             total = total / outcomes.lengths
@@ -261,7 +260,7 @@ def return_correlation(
 
 
 def _purse(
-    pay: LearnedReward, first: Tensor, total: Tensor, discount: float
+    pay: LearnedReward | GoalReward, first: Tensor, total: Tensor, discount: float
 ) -> Callable[[Tensor, TensorDictBase], None]:
     """Return what adds each step's learned reward to ``total``."""
     step = 0
@@ -269,7 +268,7 @@ def _purse(
 
     def collect(rows: Tensor, transition: TensorDictBase) -> None:
         nonlocal step
-        transition[pay.initial_pixels_key] = first[rows]
+        transition[keys.INITIAL_PIXELS] = first[rows]
         reward, reached = (part.reshape(-1) for part in pay.pay(transition, transition[keys.NEXT]))
         total[rows] += discount**step * reward.where(~arrived[rows], 0.0)
         if pay.arrival is not None:  # where practice would end the episode

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys, modules
-from ifo_grounding.attributes import answers
+from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
 from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError, at_least_one, check_choice
@@ -174,7 +174,7 @@ def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
             f"options {sorted(env_options)} are for an environment made from a task's name: "
             "give them to your environment"
         )
-    if False in answers(env, "instructed"):
+    if attribute(env, "instructed") is False:
         raise UserError(
             "an environment made with instructed=False pays no true reward, whatever chooses its "
             "instructions: evaluate in one with instructed=True"

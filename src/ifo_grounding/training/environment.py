@@ -15,22 +15,21 @@ from ifo_grounding.attributes import first_worker
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.supervised import Metrics
-from ifo_grounding.transforms._common import exposes_state, innermost, instructs, parts_of
+from ifo_grounding.transforms._common import exposes_state, instructs, parts_of
 
 
 def check_env(env: EnvBase) -> None:
     """Refuse an env that shows the true state or instructions, or pays no learned reward."""
-    simulator = innermost(env)
-    if exposes_state(simulator):
+    if exposes_state(env):
         raise UserError("self-examination never sees the true state: use expose_state=False")
-    if instructs(simulator):
+    if instructs(env):
         raise UserError("self-examination never sees true instructions: use instructed=False")
     observed = env.observation_spec.keys(True, True)
     if keys.INSTRUCTION not in observed:
         raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
     written = [*env.full_reward_spec.keys(True, True), *observed]
     if keys.LEARNED_REWARD not in written:
-        raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
+        raise UserError("the env pays no learned reward: add LearnedReward or GoalReward")
 
 
 def make_collector(env: EnvBase, policy: nn.Module, steps: int) -> Collector:
@@ -68,10 +67,11 @@ def fixes_scenes(transform: nn.Module) -> bool:
 
 def workers_fix_scenes(env: EnvBase) -> bool:
     """Whether transforms inside of workers begin episodes in scenes that they know."""
-    base = innermost(env)
-    if not isinstance(base, BatchedEnvBase):
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    if not isinstance(env, BatchedEnvBase):
         return False
-    worker = first_worker(base)
+    worker = first_worker(env)
     return any(map(fixes_scenes, transforms_of(worker))) or workers_fix_scenes(worker)
 
 

@@ -1,14 +1,14 @@
 """Transforms of self-examination: an instruction for every episode, a reward for every step."""
 
 from ifo_grounding.transforms.choosing import Choices, PoolScorer, choose_instructions
-from ifo_grounding.transforms.decode import FrameDecoder
+from ifo_grounding.transforms.goal import GoalReward
 from ifo_grounding.transforms.reward import LearnedReward
 from ifo_grounding.transforms.sampler import InstructionSampler, NothingSuitableError
 from ifo_grounding.transforms.starts import StartingPairs, frame_hash
 
 __all__ = [
     "Choices",
-    "FrameDecoder",
+    "GoalReward",
     "InstructionSampler",
     "LearnedReward",
     "NothingSuitableError",

@@ -1,4 +1,4 @@
-"""What the transforms share: reset masks, judges in eval mode, what an environment shows."""
+"""What the transforms share: reset masks, models in eval mode, what an environment shows."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
-from torchrl.envs.batched_envs import BatchedEnvBase
+from torchrl.envs import Compose, EnvBase, Transform
 
-from ifo_grounding.attributes import answers, first_worker
+from ifo_grounding.attributes import attribute, innermost
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import INSTRUCTION
 
@@ -23,9 +22,9 @@ def parts_of(transform: Transform) -> list[Transform]:
 
 
 class EpisodeTransform(Transform):
-    """A transform that acts where episodes begin and leaves the mode of its judge alone.
+    """A transform that acts where episodes begin and leaves the mode of its model alone.
 
-    ``env.eval()`` and ``env.train()`` reach every transform. A judge may be in training elsewhere
+    ``env.eval()`` and ``env.train()`` reach every transform. A model may be in training elsewhere
     at that moment, so its mode is changed only while it scores.
     """
 
@@ -74,7 +73,7 @@ class InstructionTransform(EpisodeTransform):
         raise NotImplementedError
 
     def check_env(self, env: EnvBase) -> None:
-        """Raise :class:`UserError` where the innermost environment does not suit."""
+        """Raise :class:`UserError` where an environment does not suit."""
         if exposes_state(env):
             raise UserError(
                 f"{type(self).__name__} refuses an environment that exposes its true state: a "
@@ -88,9 +87,9 @@ class InstructionTransform(EpisodeTransform):
         return next_tensordict.set(self.out_keys[0], instruction)
 
     def _spec(self, like: Composite) -> Bounded:
-        size, env, largest = self.vocabulary_size, base_of(self), int(self.tokens.max())
-        if size is None and env is not None and not isinstance(env, BatchedEnvBase):
-            size = getattr(env, "vocabulary_size", None)
+        size, largest = self.vocabulary_size, int(self.tokens.max())
+        if size is None and self.container is not None:
+            size = attribute(self.container, "vocabulary_size")
         if size is not None and largest >= size:
             raise UserError(
                 f"there is a token id {largest}, but the vocabulary has {size} ids: pass the "
@@ -110,8 +109,8 @@ class InstructionTransform(EpisodeTransform):
         Raises:
             UserError: where the environment does not suit or has an instruction already.
         """
-        if (env := base_of(self)) is not None:
-            self.check_env(env)
+        if self.container is not None:
+            self.check_env(self.container)
         key = self.out_keys[0]
         if key in observation_spec.keys(True, True):
             raise UserError(
@@ -127,41 +126,21 @@ class InstructionTransform(EpisodeTransform):
         return state_spec
 
 
-def base_of(transform: Transform) -> EnvBase | None:
-    """Innermost environment around a transform, None where there is none."""
-    env = transform.container
-    return None if env is None else innermost(env)
-
-
-def innermost(env: EnvBase) -> EnvBase:
-    """Return the environment that all transforms of ``env`` are around."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
-
-
 def exposes_state(env: EnvBase) -> bool:
-    """Tell whether an environment without transforms shows its true state, or can be set to one."""
-    if isinstance(env, BatchedEnvBase):
-        return env._supports_set_state  # entries that workers' transforms carry are no true state
-    return getattr(env, "expose_state", False) or not env.state_spec.is_empty(recurse=True)
+    """Tell whether an environment shows its true state, or can be set to one."""
+    env = innermost(env)
+    return bool(attribute(env, "expose_state")) or not env.state_spec.is_empty(recurse=True)
 
 
 def instructs(env: EnvBase) -> bool:
-    """Tell whether an environment without transforms, or a worker's, brings instructions.
-
-    One that does not say so itself does where it shows an ``instruction``.
-    """
-    told = [answer for answer in answers(env, "instructed") if answer is not None]
-    if told:
-        return any(told)
-    if isinstance(env, BatchedEnvBase):
-        return instructs(innermost(first_worker(env)))
-    return INSTRUCTION in env.observation_spec.keys(True, True)
+    """Tell whether an environment brings instructions: as it declares, or as its specs show."""
+    env = innermost(env)
+    shows = INSTRUCTION in env.observation_spec.keys(True, True)
+    return bool(attribute(env, "instructed", shows))
 
 
 def flat_logit(logit: Tensor, rows: int, name: NestedKey) -> Tensor:
-    """Check a judge's output and return it as [rows].
+    """Check a model's output and return it as [rows].
 
     Raises:
         UserError: where its shape is not [rows, 1] or it is not a number.

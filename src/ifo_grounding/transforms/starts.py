@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.errors import UserError
@@ -151,8 +151,10 @@ class StartingPairs(InstructionTransform):
             )
 
     def check_env(self, env: EnvBase) -> None:
-        """Raise :class:`UserError` where the innermost environment does not suit."""
+        """Raise :class:`UserError` where an environment does not suit."""
         super().check_env(env)
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
         if isinstance(env, BatchedEnvBase):
             raise UserError(
                 f"{type(self).__name__} cannot reach the simulators through a "
