@@ -22,7 +22,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.machine import machine_of
 from ifo_grounding.options import plain
-from ifo_grounding.training import FitConfig, Run, Stage, fit
+from ifo_grounding.training import FitConfig, Run, Stage, Trial, fit
 from ifo_grounding.worlds import World
 
 torchrl_logger.setLevel("WARNING")
@@ -123,21 +123,31 @@ def learn(
 ) -> dict[str, Any]:
     """Fit a network to a buffer, save it, and finish the stage."""
     decode_on(options.device, buffer)
-    history = fit(loss, buffer, config, **fit_options(options, stage), **kwargs)
+    how = {"checkpoint": stage.checkpoint, "log": stage.log(), **fit_options(options, stage)}
+    history = fit(loss, buffer, config, **how, **kwargs)
     networks.save(loss.network, stage.run / file)
     return finish(options, stage, history[-1], history)
 
 
+def keep(
+    options: Options, stage: Stage, best: Trial, file: str, calibrate: bool = False
+) -> dict[str, Any]:
+    """Train the best of several trials to the end, save its network, and finish the stage."""
+    history = best.finish(stage.log())
+    if calibrate:
+        best.loss.calibrate()
+    networks.save(best.loss.network, stage.run / file)
+    return finish(options, stage, {**history[-1], "trial": best.number}, history)
+
+
 def fit_options(options: Options, stage: Stage) -> dict[str, Any]:
-    """Return how :func:`fit` is called for a stage: seeds, checkpoints, logs."""
+    """Return how :func:`fit` is called for a stage."""
     return {
         "seed": options.seed,
         "name": stage.name,
-        "checkpoint": stage.checkpoint,
         "checkpoint_seconds": options.checkpoint_seconds,
         "progress": shows_progress(options),
         "cudagraph": True,
-        "log": stage.log(),
     }
 
 

@@ -33,12 +33,8 @@ def continue_imitation(options: Options) -> dict:
         best = BestCheckpoint(env, policy, section, options.seed, held_out, by_accuracy)
         best.look()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)
-        config = replace(
-            config, validate_every=math.ceil(config.steps / config.iteration / looks)
-        )
-    return learn(
-        options, stage, ImitationLoss(policy), seen, config, CONTINUED, held_out=best
-    )
+        config = replace(config, validate_every=math.ceil(config.steps / config.iteration / looks))
+    return learn(options, stage, ImitationLoss(policy), seen, config, CONTINUED, held_out=best)
 
 
 def matched_steps(options: Options) -> int:

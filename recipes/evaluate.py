@@ -86,9 +86,7 @@ def measured_success(policies: dict[str, Any], options: Options) -> dict[str, Su
 def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[str, Any]]:
     """Return the instructed world of the evaluation scenes, and how to play it."""
     scenes = {**evaluation_scenes(options), **chosen}
-    env = world_of(options).instructed(
-        min(episodes, ROWS), device=options.device, **scenes
-    )
+    env = world_of(options).instructed(min(episodes, ROWS), device=options.device, **scenes)
     how = {"seed": scenes["seed"], "stream": scenes["stream"]}
     return env, {"episodes": episodes, "max_steps": UNTIL_THE_END, **how}
 
@@ -134,9 +132,7 @@ def evaluate_rewards(policy: Any, run: Run, options: Options) -> dict[str, Any]:
     if (run / REWARD).exists():
         model = load_network(run, REWARD, "train_reward", options)
         if world.oracle is not None:
-            demos, truth = world.demonstrate(
-                HELD_OUT, seed=scenes["seed"], stream=scenes["stream"]
-            )
+            demos, truth = world.demonstrate(HELD_OUT, seed=scenes["seed"], stream=scenes["stream"])
             assert truth is not None
             results["action_reward"] = reward_audit(model, demos, truth).as_dict()
         audit = return_correlation(policy, LearnedReward(model), env, average=True, **shown)
@@ -190,7 +186,7 @@ def audit_callback(
         if shown_by_expert is not None:
             demos, truth = shown_by_expert
             assert isinstance(reward, LearnedReward) and truth is not None
-            found["action_auc"] = reward_audit(reward.reward_model, demos, truth).auc.value
+            found["action_auc"] = reward_audit(reward.model, demos, truth).auc.value
         return {**found, **fixed}
 
     return audit

@@ -3,7 +3,15 @@
 No learner of observation-only demonstrations may read these actions: a reference, not a method.
 """
 
-from _shared import REFERENCE, TRUTH, finish, load_demonstrations, load_network, open_stage, world_of
+from _shared import (
+    REFERENCE,
+    TRUTH,
+    finish,
+    load_demonstrations,
+    load_network,
+    open_stage,
+    world_of,
+)
 from evaluate import measured_success, success_results
 from imitate import imitate_transitions, split_transitions
 

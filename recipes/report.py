@@ -120,9 +120,7 @@ def episode_pictures(run: Run, options: Options, results: dict[str, Any]) -> dic
     return found | step_by_step(policies[1], improved or list(range(TRACED)), run, options)
 
 
-def step_by_step(
-    policy: Any, scenes: list[int], run: Run, options: Options
-) -> dict[str, bytes]:
+def step_by_step(policy: Any, scenes: list[int], run: Run, options: Options) -> dict[str, bytes]:
     """Animate episodes with action probabilities, learned rewards and attention."""
     rewards = {
         name: load_network(run, file, "two_phase", options)

@@ -108,7 +108,7 @@ def adversarial_updates(reward: Any, run: Run, options: Options) -> AdversarialU
     if section.reward != "action" or not section.reward_steps:
         return None
     demos = labelled_buffer(load_demonstrations(run), load_labels(run))
-    loss = RewardLoss(reward.reward_model)
+    loss = RewardLoss(reward.model)
     return AdversarialUpdates(loss, demos, section.reward_steps, section.reward_lr)
 
 

@@ -49,6 +49,20 @@ def one_line_errors() -> Iterator[None]:
         raise SystemExit(INTERRUPTED) from None
 
 
+@contextlib.contextmanager
+def raised_errors() -> Iterator[None]:
+    """Let Hydra raise what is wrong with options, which it prints and exits with otherwise."""
+    before = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = before
+
+
 def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
     """Decorate the function of a recipe script, which takes the options.
 
@@ -78,8 +92,6 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
 
             from ifo_grounding.options import CONFIG, current, explained, help_text
 
-            # Hydra then raises what is wrong instead of printing it; it is explained below.
-            os.environ["HYDRA_FULL_ERROR"] = "1"
             asked = {"-h", "--help"}.intersection(sys.argv)
             sys.argv = [each for each in sys.argv if each not in asked]
             conf = script.parent / "conf"
@@ -97,10 +109,9 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
                 config_name=script.stem if own else CONFIG,
             )
             try:
-                run(job)()
-            except UserError:
-                raise
-            except (HydraException, OmegaConfBaseException, ValueError) as error:
+                with raised_errors():
+                    run(job)()
+            except (HydraException, OmegaConfBaseException) as error:
                 raise explained(error) from None
 
     return main

@@ -252,8 +252,7 @@ class ControlsConfig:
 
 @dataclass
 class NetworksConfig:
-    """Values of :class:`~ifo_grounding.networks.NetworkConfig` for all networks of a run; null
-    leaves the preset's."""
+    """Values of ``networks.NetworkConfig`` for all networks of a run; null leaves the preset's."""
 
     features: int | None = None
     """Channels of the feature map."""
@@ -333,6 +332,8 @@ class Options:
         within(0, 86_400, checkpoint_seconds=self.checkpoint_seconds)
         if not str(self.run).strip(" /"):
             raise UserError("run needs a name, or the path of a folder")
+        if set("/\\\0") & set(self.variant or ""):
+            raise UserError(f"variant is part of a file's name, without slashes: {self.variant!r}")
         check_device(self.device)
 
 

@@ -44,6 +44,8 @@ def options_of(*overrides: str) -> Options:
     try:
         with initialize_config_dir(version_base=None, config_dir=str(recipes_folder() / "conf")):
             return settled(compose(CONFIG, list(overrides)), overrides)
+    except UserError:
+        raise
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise explained(error) from None
 
@@ -79,7 +81,9 @@ def _demonstrations(cfg: DictConfig) -> int:
     folder = Path(cfg.recorded)
     if not folder.is_dir():
         raise UserError(f"recorded={folder} is no folder of demonstrations")
-    return min(asked, len(read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder)))
+    return min(
+        asked, len(read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder))
+    )
 
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Sequence[str]) -> DictConfig:
@@ -106,12 +110,18 @@ def typed(cfg: DictConfig) -> Options:
             try:
                 value = kind(**value)
             except UserError as error:
-                raise UserError(f"{field.name}.{error}") from None
+                raise UserError(_placed(str(error), field.name)) from None
         options[field.name] = value
     for name, value in _leaves(values):
         if isinstance(value, int) and abs(value) > LARGEST and not name.endswith("seed"):
             raise UserError(f"{name} must be at most {LARGEST:,}, got {value}")
     return Options(**options)
+
+
+def _placed(error: str, section: str) -> str:
+    """Say in which section the option is that an error begins with."""
+    unknown = error.removeprefix("unknown ")
+    return f"{section}.{error}" if unknown == error else f"unknown {section}.{unknown}"
 
 
 def plain(node: Any) -> Any:
@@ -155,7 +165,7 @@ def explained(error: Exception) -> UserError:
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)) and cause.full_key:
         section, _, name = cause.full_key.rpartition(".")
         parent = cause.parent_node
-        names = sorted(map(str, parent)) if isinstance(parent, DictConfig) else []
+        names = sorted({*map(str, parent or ())} - {"hydra"})
         where = f"{section!r} has" if section else "there are"
         hint = did_you_mean(name, names)
         return UserError(f"unknown option {cause.full_key!r}{hint}: {where} {', '.join(names)}")
@@ -168,7 +178,10 @@ def explained(error: Exception) -> UserError:
 def help_text(recipe: str, cfg: DictConfig) -> str:
     """Return all options with their values and what they mean, section by section."""
     kind = OmegaConf.get_type(cfg)
-    lines = [f"{recipe}: options are written name=value, those of a section section.name=value.", ""]
+    lines = [
+        f"{recipe}: options are written name=value, those of a section section.name=value.",
+        "",
+    ]
     for group in ("preset", "budget", "world") if kind is Options else ():
         files = (recipes_folder() / "conf" / group).glob("*.yaml")
         lines.append(f"  {group}: {', '.join(sorted(path.stem for path in files))}")
@@ -190,15 +203,22 @@ def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[s
             if inner:
                 yield from described(inner, value, f"{name}.")
             else:
-                yield from (f"  {name}.{key}={value[key]}" for key in value)
+                yield from (f"  {name}.{key}={_written(value[key])}" for key in value)
             continue
-        shown = {None: "null", True: "true", False: "false"}.get(value, value) if not isinstance(
-            value, list
-        ) else value
-        text = f"{name}={shown}"
+        text = f"{name}={_written(value)}"
         meaning = textwrap.wrap(docs.get(each.name, ""), 62) or [""]
-        yield f"  {text:<36}  {meaning[0]}".rstrip() if len(text) <= 36 else f"  {text}"
-        yield from (f"{'':<40}{more}" for more in meaning[len(text) <= 36 :])
+        fits = len(text) <= 36
+        yield f"  {text:<36}  {meaning[0]}".rstrip() if fits else f"  {text}"
+        yield from (f"{'':<40}{more}" for more in meaning[fits:])
+
+
+def _written(value: Any) -> str:
+    """Write a value as it is given on a command line."""
+    return (
+        {None: "null", True: "true", False: "false"}[value]
+        if value is None or isinstance(value, bool)
+        else str(value)
+    )
 
 
 def field_docs(kind: type) -> dict[str, str]:

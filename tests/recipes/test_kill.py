@@ -15,7 +15,13 @@ from ifo_grounding.cli import recipes_folder
 from ifo_grounding.files import read_json
 
 STAGES = ["record_demonstrations", "collect_transitions", "train_inverse", "label"]
-OPTIONS = ["budget=tiny", "demonstrations.n=60", "progress=false", "threads=1", "checkpoint_seconds=0"]
+OPTIONS = [
+    "budget=tiny",
+    "demonstrations.n=60",
+    "progress=false",
+    "threads=1",
+    "checkpoint_seconds=0",
+]
 
 
 def start(name, run, *extra):

@@ -68,9 +68,7 @@ def test_both_phases_run_through_and_write_a_report(options, tmp_path, task, pre
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
 
 
-@pytest.mark.parametrize(
-    "preset", ["strong", pytest.param("paper", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("preset", ["strong", pytest.param("paper", marks=pytest.mark.slow)])
 def test_both_phases_run_on_a_gpu(options, preset):
     from two_phase import two_phase
 
@@ -141,9 +139,7 @@ def test_a_stage_without_what_it_needs_says_what_to_run(options):
         evaluate(options())
 
 
-def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_states(
-    options, phase_1
-):
+def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_states(options, phase_1):
     from _shared import load_demonstrations, load_network, open_run
     from train_instruction import fresh_states, losses
 
@@ -158,7 +154,11 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
     )
     for part, last in (("about_form.weight", True), ("role.weight", False)):
         weight = theirs.state_dict()[part]
-        assert [torch.equal(words.state_dict()[part], weight) for words in own] == [True, True, last]
+        assert [torch.equal(words.state_dict()[part], weight) for words in own] == [
+            True,
+            True,
+            last,
+        ]
     heads = [each.network.module.head[1].weight for each in tried]
     assert not torch.equal(heads[0], heads[1])
     assert fresh_states(given, 301) is None

@@ -134,7 +134,10 @@ def test_a_stage_runs_on_ones_own_world_from_the_command_line(dial, tmp_path):
     ("said", "refused"),
     [
         (["world=own", "world._target_=own_dial.Dial"], "is no ifo_grounding.worlds.World"),
-        (["world=own", "world._target_=nowhere.Dial"], "world._target_=nowhere.Dial cannot be made"),
+        (
+            ["world=own", "world._target_=nowhere.Dial"],
+            "world._target_=nowhere.Dial cannot be made",
+        ),
         (["world=own", "world._target_=own_dial.DialWorld", "+world.x=1"], "cannot be made with"),
         (["world=own"], "world._target_"),
         (["world._target_=own_dial.DialWorld"], "cannot be made with"),

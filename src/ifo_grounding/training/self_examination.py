@@ -33,7 +33,7 @@ ALGORITHMS = ("ppo", "reinforce")
 NAME = "self-examination"
 
 
-@dataclass(frozen=True)
+@dataclass
 class SelfExaminationConfig:
     """How the policy is improved."""
 

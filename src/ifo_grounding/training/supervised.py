@@ -40,7 +40,7 @@ class Validation(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> Any: ...  # noqa: D102
 
 
-@dataclass(frozen=True)
+@dataclass
 class FitConfig:
     """How long and how fast to learn."""
 
