@@ -181,7 +181,7 @@ def audit_callback(
             "success_stopped": result.stopped.rate,
             "audit_return": float(paid.returns.mean()),
             "audit_success": paid.success.rate,
-            "reward_auc": paid.auc.value,
+            "return_auc": paid.auc.value,
         }
         if shown_by_expert is not None:
             demos, truth = shown_by_expert
