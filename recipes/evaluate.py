@@ -161,7 +161,7 @@ def evaluate_judges(policy: Any, run: Run, world: World) -> dict[str, Any]:
         if world.oracle:
             demos, truth = world.demonstrate(HELD_OUT, **audited)
             results["action_reward"] = reward_audit(judge, demos, truth).as_dict()
-        audit = return_correlation(policy, judge, place, average=True, **shown)
+        audit = return_correlation(policy, LearnedReward(judge), place, average=True, **shown)
         results["action_return"] = audit.as_dict()
     if run.is_current("train_goal"):
         judge = load_network(run, GOAL, "train_goal", options)
