@@ -38,10 +38,6 @@ class RewardAudit(Described):
     first: Rate
     """Share of transitions where the expert's action scores highest."""
 
-    def __str__(self) -> str:
-        """Return the area with its interval."""
-        return str(self.auc)
-
 
 def reward_audit(
     reward_model: TensorDictModuleBase,
@@ -154,10 +150,6 @@ class ReturnAudit(Described):
     """Learned return of each episode, float32 [N]."""
     outcomes: Tensor
     """True success of each episode, bool [N]."""
-
-    def __str__(self) -> str:
-        """Return the correlation with its interval."""
-        return str(self.correlation)
 
 
 def return_correlation(

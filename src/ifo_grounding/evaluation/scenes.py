@@ -146,17 +146,12 @@ def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
             "instructions: evaluate in one with instructed=True"
         )
     shown = env.observation_spec.keys(True, True)
-    if keys.INSTRUCTION not in shown:
-        raise UserError(
-            "success needs an environment that shows its instruction under "
-            f"{keys.INSTRUCTION!r}: make it with instructed=True, or rename its entry with "
-            "torchrl.envs.RenameTransform"
-        )
-    if keys.PIXELS not in shown:
-        raise UserError(
-            f"success needs an environment that shows its image under {keys.PIXELS!r}: rename its "
-            "entry with torchrl.envs.RenameTransform"
-        )
+    for key, what in ((keys.INSTRUCTION, "instruction"), (keys.PIXELS, "image")):
+        if key not in shown:
+            raise UserError(
+                f"success needs an environment that shows its {what} under {key!r}: make it with "
+                "instructed=True, or rename its entry with torchrl.envs.RenameTransform"
+            )
     if len(env.reward_keys) > 1 and keys.REWARD not in env.reward_keys:
         raise UserError(
             f"the environment pays {env.reward_keys}: success is seen from the true reward, named "

@@ -40,10 +40,6 @@ class SuccessResult(Described):
         values = {**super().as_dict(), "mean_length": float(self.lengths.double().mean())}
         return {name: value for name, value in values.items() if value is not None}
 
-    def __str__(self) -> str:
-        """Return the rate with its interval."""
-        return str(self.rate)
-
 
 def success_rate(
     policy: Policy,

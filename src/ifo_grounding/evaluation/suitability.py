@@ -71,10 +71,6 @@ class SuitabilityResult(Described):
     """Of random pairs, by bins of the probability that they are said to have: its mean, and the
     share that is suitable. Equal where the module is calibrated."""
 
-    def __str__(self) -> str:
-        """Return the suitable rate with its interval."""
-        return str(self.rate)
-
 
 def suitable_rate(
     classifier: TensorDictModuleBase,

@@ -26,7 +26,7 @@ def _digits(rate: float, width: float) -> int:
 
 
 class Described:
-    """Gives a result dataclass a form for JSON."""
+    """Gives a result dataclass a form for JSON, and its first field, the headline, as its text."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain values; what is undefined becomes None, arrays are left out.
@@ -36,6 +36,10 @@ class Described:
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
         return {k: _plain(v) for k, v in values.items() if not hasattr(v, "shape")}
+
+    def __str__(self) -> str:
+        """Return the headline with its interval."""
+        return str(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
 
 
 def _plain(value: Any) -> Any:
