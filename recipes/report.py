@@ -21,7 +21,7 @@ from evaluate import UNTIL_THE_END, evaluate
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
-from ifo_grounding.evaluation import Rate, record_episodes, trace_episode
+from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.files import read_json
 from ifo_grounding.report import (
     animation,
@@ -34,6 +34,7 @@ from ifo_grounding.report import (
     write_report,
 )
 from ifo_grounding.report.results import restored, unpacked
+from ifo_grounding.stats import Rate
 from ifo_grounding.training import Run
 
 CURVES = {

@@ -155,7 +155,7 @@ def _remember(asked: TensorDictBase, env: EnvBase, state: TensorDictBase, active
 def _steps_on(env: EnvBase) -> bool:
     """Whether an environment declares that rows may be stepped after their end.
 
-    That spares new scenes for rows that nobody looks at; others are reset.
+    That spares new scenes for rows that count no more; others are reset.
     """
     while isinstance(env, TransformedEnv):
         env = env.base_env

@@ -24,6 +24,11 @@ class Expert:
         wanted = self.scenes.scenes(td["scene"].squeeze(-1)).wanted
         return td.set("action", expert.act(state, wanted))
 
+    def on_even_scenes(self, td: TensorDictBase) -> TensorDictBase:
+        """Solve even scenes; stop at once in odd ones."""
+        action = self(td)["action"]
+        return td.set("action", torch.where(td["scene"].squeeze(-1) % 2 == 0, action, 5))
+
     def steps(self, episodes: int) -> torch.Tensor:
         """Lengths of the shortest solutions."""
         return self.scenes.scenes(torch.arange(episodes)).wanted.steps
@@ -39,3 +44,9 @@ def make_expert():
 def random_policy():
     """Draw actions uniformly."""
     return lambda td: td.set("action", torch.randint(6, td.shape))
+
+
+@pytest.fixture
+def up():
+    """Always walk up."""
+    return lambda td: td.set("action", torch.zeros(td.shape, dtype=torch.int64))

@@ -31,18 +31,10 @@ def test_accuracy_by_hand():
     assert "worst P: 33.3%" in str(accuracy)
 
 
-def test_truth_of_a_recording_against_itself_and_against_a_fault():
-    demos, truth = record_demonstrations("pick", 50, keep_truth=True)
-    perfect = LabelReport(truth.actions, torch.ones(len(truth.actions)), 6)
-    accuracy = label_accuracy(perfect, truth)
+def test_a_report_of_labels_against_the_truth_of_a_recording():
+    demos, truth = record_demonstrations("pick", 20, keep_truth=True)
+    accuracy = label_accuracy(LabelReport(truth.actions, torch.ones(len(truth.actions)), 6), truth)
     assert accuracy.rate.rate == 1.0 and accuracy.rate.count == demos.transitions
-    places = (truth.actions == 4).nonzero().squeeze(-1)
-    faulty = truth.actions.clone()
-    faulty[places[:10]] = 5
-    accuracy = label_accuracy(faulty, truth)
-    assert accuracy.worst == "P"
-    assert accuracy.per_action["P"].rate == pytest.approx(1 - 10 / len(places))
-    assert accuracy.confusion[4, 5] == 10
 
 
 @pytest.mark.parametrize(

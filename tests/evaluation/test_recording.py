@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 from torchrl.envs import GymEnv, SerialEnv
 
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -32,14 +31,15 @@ def test_frames_actions_and_outcome_belong_together(make_expert):
         grammar("pick-out").parse(episode.sentence)
 
 
-def test_outcomes_agree_with_the_success_rate():
-    def up(td):
-        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
-
+def test_outcomes_agree_with_the_success_rate(up, random_policy):
     outcomes = success_rate(up, "move", episodes=100).outcomes
     episodes = record_episodes(up, "move", range(100))
     assert [episode.success for episode in episodes] == outcomes.tolist()
     assert any(outcomes) and not any(episode.stopped for episode in episodes)
+    # Sampled actions are the same too, of the same batch.
+    lengths = success_rate(random_policy, "move", mode="sampled", episodes=9).lengths
+    episodes = record_episodes(random_policy, "move", range(9), mode="sampled")
+    assert [len(episode.actions) for episode in episodes] == lengths.tolist()
 
 
 def test_frames_for_people_are_larger(random_policy):
@@ -63,5 +63,7 @@ def test_scenes_of_a_world_without_numbers_are_the_first_ones(random_policy):
         record_episodes(random_policy, world, [5, 9])
 
 
-def test_no_scenes_no_episodes(random_policy):
+def test_scenes_that_do_not_fit(random_policy):
     assert record_episodes(random_policy, "move", []) == []
+    with pytest.raises(UserError, match="has 2 rows for 3 scenes"):
+        record_episodes(random_policy, PickAndPlaceEnv("move", num_envs=2), range(3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +13,9 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.episodes import Outcomes, Policy, play
-from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation.scenes import MAX_STEPS, device_of, play_scenes, scene_batches
+from ifo_grounding.episodes import Outcomes, Policy
+from ifo_grounding.errors import UserError, at_least_one
+from ifo_grounding.evaluation.scenes import Player, play_scenes
 from ifo_grounding.tasks.goals import SIDES, Goal, Plan
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.world import SHAPES, WorldState, kind_name, neighbour
@@ -52,10 +51,10 @@ class Endings:
     @property
     def shared(self) -> dict[str, int]:
         """Wrong objects by what they have in common with the right one."""
-        wrong = self.kind == WRONG_OBJECT
-        colours, shapes = looks(self.mistaken[wrong]), looks(self.wanted[wrong])
-        same_colour, same_shape = (a == b for a, b in zip(colours, shapes, strict=True))
-        found = (3 - 2 * same_colour.long() - same_shape.long()).bincount(minlength=len(SHARED))
+        wrong, n = self.kind == WRONG_OBJECT, len(SHAPES)  # kind - 1 is colour * n + shape
+        mistaken, wanted = self.mistaken[wrong] - 1, self.wanted[wrong] - 1
+        colour, shape = mistaken // n == wanted // n, mistaken % n == wanted % n
+        found = (3 - 2 * colour.long() - shape.long()).bincount(minlength=len(SHARED))
         return dict(zip(SHARED, found.tolist(), strict=True))
 
     @property
@@ -76,42 +75,23 @@ def episode_endings(
     policy: Policy,
     task: str,
     *,
-    mode: str = "greedy",
     episodes: int = 2000,
-    seed: int = 0,
-    stream: str = "evaluation",
-    batch_size: int = 1000,
-    device: torch.device | str | None = None,
-    max_steps: int = MAX_STEPS,
-    **env_options: Any,
+    **options: Any,
 ) -> Endings:
     """Play the scenes of :func:`success_rate` and say how each episode ended.
 
     Args:
         policy: writes an action.
         task: name of the task.
-        mode: ``greedy`` or ``sampled``.
         episodes: number of scenes.
-        seed: of the scenes and, where sampled, of the actions.
-        stream: ``training``, ``validation`` or ``evaluation``.
-        batch_size: episodes side by side.
-        device: where to run; the policy's by default.
-        max_steps: most actions per episode.
-        env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
+        options: of :func:`success_rate`, such as ``mode``, ``seed``, ``stream`` and ``split``.
 
     >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
     >>> episode_endings(stop, "pick", episodes=50).counts["nothing done"]
     50
     """
-    options = {"batch_size": batch_size, "max_steps": max_steps, **env_options}
-    options["device"] = torch.device(device) if device is not None else device_of(policy)
-    batches = scene_batches(task, range(episodes), seed=seed, stream=stream, **options)
-
-    def play_batch(env: EnvBase, start: TensorDictBase) -> Iterator[Tensor]:
-        assert isinstance(env, PickAndPlaceEnv)
-        return _play(policy, env, start, mode)
-
-    (kind, wanted, mistaken, actions), scenes = play_scenes(policy, batches, seed, mode, play_batch)
+    numbers = range(at_least_one("episodes", episodes))
+    (kind, wanted, mistaken, actions), scenes = play_scenes(policy, task, numbers, _play, **options)
     return Endings(kind, wanted, mistaken, actions, scenes)
 
 
@@ -141,10 +121,9 @@ def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
     }
 
 
-def _play(
-    policy: Policy, env: PickAndPlaceEnv, start: TensorDictBase, mode: str
-) -> Iterator[Tensor]:
-    """Yield how each row's episode ended, wanted and mistaken objects [B], and actions [B, T]."""
+def _play(player: Player, env: EnvBase, start: TensorDictBase) -> tuple[Tensor, ...]:
+    """Return how episodes ended, what was wanted and mistaken, and what was done."""
+    assert isinstance(env, PickAndPlaceEnv)
     first, wanted = env.simulator.state.clone(), env.simulator.wanted.clone()
     goal = grammar(env.task).parse_tokens(start[keys.INSTRUCTION])
     last = first.clone()
@@ -157,9 +136,9 @@ def _play(
         actions[rows, taken[rows]] = transition[keys.ACTION].to(torch.int8)
         taken[rows] += 1
 
-    outcomes = play(policy, env, start, mode=mode, max_steps=shape[1], on_step=keep)
+    outcomes = player(env, start, on_step=keep)
     kind, mistaken = _ending(first, last, wanted, goal, outcomes)
-    yield from (kind, goal.object, mistaken, actions)
+    return kind, goal.object, mistaken, actions
 
 
 def _ending(
@@ -191,11 +170,6 @@ def _carried(first: WorldState, last: WorldState, wanted: Plan, goal: Goal) -> T
     others = first.objects.scatter(-1, wanted.object_cell.unsqueeze(-1), 0)
     gone = (others > 0) & (last.objects != others)
     return others.gather(-1, gone.byte().argmax(-1, keepdim=True)).squeeze(-1).long() * gone.any(-1)
-
-
-def looks(kinds: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the numbers of the colours and of the shapes of object kinds."""
-    return (kinds - 1) // len(SHAPES), (kinds - 1) % len(SHAPES)
 
 
 def _counts(kinds: Tensor) -> dict[str, int]:

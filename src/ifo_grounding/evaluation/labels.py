@@ -12,11 +12,11 @@ from torch import Tensor
 from ifo_grounding import keys
 from ifo_grounding.data import LabelReport, Truth
 from ifo_grounding.errors import UserError
-from ifo_grounding.stats import Rate, wilson
+from ifo_grounding.stats import Described, Rate, wilson
 
 
 @dataclass(frozen=True)
-class LabelAccuracy:
+class LabelAccuracy(Described):
     """Accuracy of labelled actions against the true ones."""
 
     rate: Rate
@@ -30,12 +30,7 @@ class LabelAccuracy:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        return {
-            "rate": self.rate.as_dict(),
-            "per_action": {name: rate.as_dict() for name, rate in self.per_action.items()},
-            "worst": self.worst,
-            "confusion": self.confusion.tolist(),
-        }
+        return {**super().as_dict(), "confusion": self.confusion.tolist()}
 
     def __str__(self) -> str:
         """Return the accuracy, and the worst action's."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -15,11 +14,9 @@ from torchrl.envs import EnvBase
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.episodes import Policy, play
+from ifo_grounding.episodes import Outcomes, Policy
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation.scenes import device_of, most_steps, scene_batches, seeded
-from ifo_grounding.modules import evaluating
-from ifo_grounding.seeding import derive
+from ifo_grounding.evaluation.scenes import Player, play_scenes
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 
 
@@ -46,13 +43,8 @@ def record_episodes(
     env_or_task: EnvBase | str,
     scenes: Sequence[int] = range(8),
     *,
-    seed: int = 0,
-    stream: str = "evaluation",
-    mode: str = "greedy",
-    max_steps: int | None = None,
     render_tile_size: int | None = None,
-    device: torch.device | str | None = None,
-    **env_options: Any,
+    **options: Any,
 ) -> list[Episode]:
     """Play the scenes with the given numbers and keep their frames.
 
@@ -64,16 +56,14 @@ def record_episodes(
         env_or_task: name of a task, or an instructed environment with as many rows as scenes are
             asked for. Those of :func:`~ifo_grounding.envs.from_gymnasium` have numbers.
         scenes: numbers of the scenes; of other environments the first ones, ``range(n)``.
-        seed: of the stream.
-        stream: ``training``, ``validation`` or ``evaluation``.
-        mode: ``greedy`` or ``sampled``.
-        max_steps: most actions per episode, one that has not ended by then is a failure; by default
-            40 for a task's name, and 1,000 in an environment, whose own limit may be lower.
         render_tile_size: size of a cell in the kept frames, for people (16 or 32), for a task's
             name; what the policy sees where None.
-        device: where to run; the policy's by default.
-        env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
+        options: of :func:`success_rate`, such as ``mode``, ``seed``, ``stream`` and ``max_steps``.
 
+    Raises:
+        UserError: where the environment has not one row for each scene.
+
+    >>> import torch
     >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
     >>> episode = record_episodes(stop, "move", [3])[0]
     >>> episode.frames.shape, episode.actions.tolist(), episode.stopped
@@ -81,47 +71,49 @@ def record_episodes(
     """
     if not len(scenes):
         return []
-    where = torch.device(device) if device is not None else device_of(policy)
-    options = {"batch_size": len(scenes), "device": where, **env_options}
-    options["max_steps"] = limit = most_steps(env_or_task, max_steps)
-    env, start, _ = next(scene_batches(env_or_task, scenes, seed=seed, stream=stream, **options))
-    if env.batch_size.numel() != len(scenes):
-        raise UserError(
-            f"the environment has {env.batch_size.numel()} rows for {len(scenes)} scenes: make it "
-            "with as many"
-        )
-
-    def look(shown: TensorDictBase) -> np.ndarray:
-        if not isinstance(env, PickAndPlaceEnv):
-            return shown.reshape(shown.batch_size.numel())[keys.PIXELS].cpu().numpy()
-        tile_size = env.tile_size if render_tile_size is None else render_tile_size
-        return env.render(tile_size).transpose(0, 3, 1, 2)
-
-    frames = [[frame] for frame in look(start)]
+    frames: list[list[np.ndarray]] = []
     actions: list[list[int]] = [[] for _ in scenes]
-    vocabulary: Vocabulary = attribute(env, "vocabulary", VOCABULARY)
-    told = start.reshape(len(scenes))[keys.INSTRUCTION]
-    sentences = vocabulary.decode(told.cpu())
+    sentences: list[str] = []
 
-    def keep(rows: Tensor, transition: TensorDictBase) -> None:
-        # The grid is drawn as a whole, at the size for people; of others, the rows that moved.
-        whole = isinstance(env, PickAndPlaceEnv)
-        seen = look(transition[keys.NEXT])
-        taken = transition[keys.ACTION].tolist()
-        for place, (row, action) in enumerate(zip(rows.tolist(), taken, strict=True)):
-            frames[row].append(seen[row if whole else place])
-            actions[row].append(action)
+    def play_batch(player: Player, env: EnvBase, start: TensorDictBase) -> Outcomes:
+        rows = env.batch_size.numel()
+        if rows != len(scenes):
+            raise UserError(
+                f"the environment has {rows} rows for {len(scenes)} scenes: make it with as many"
+            )
+        frames.extend([frame] for frame in _seen(env, start.reshape(rows), render_tile_size))
+        vocabulary: Vocabulary = attribute(env, "vocabulary", VOCABULARY)
+        sentences.extend(vocabulary.decode(start.reshape(rows)[keys.INSTRUCTION].cpu()))
 
-    with evaluating(policy), seeded(derive(seed, "record", mode), where):
-        outcomes = play(policy, env, start, mode=mode, max_steps=limit, on_step=keep)
+        def keep(running: Tensor, transition: TensorDictBase) -> None:
+            # The grid is drawn as a whole, at the size for people; of others, the rows that moved.
+            whole = isinstance(env, PickAndPlaceEnv)
+            seen = _seen(env, transition[keys.NEXT], render_tile_size)
+            taken = transition[keys.ACTION].tolist()
+            for place, (row, action) in enumerate(zip(running.tolist(), taken, strict=True)):
+                frames[row].append(seen[row if whole else place])
+                actions[row].append(action)
+
+        return player(env, start, on_step=keep)
+
+    (success, _, stopped), _ = play_scenes(
+        policy, env_or_task, scenes, play_batch, **{"batch_size": len(scenes), **options}
+    )
     return [
         Episode(
             frames=np.stack(frames[row]),
             actions=np.array(actions[row]),
             sentence=sentences[row],
-            success=bool(outcomes.success[row]),
-            stopped=bool(outcomes.stopped[row]),
+            success=bool(success[row]),
+            stopped=bool(stopped[row]),
             scene=int(number),
         )
         for row, number in enumerate(scenes)
     ]
+
+
+def _seen(env: EnvBase, shown: TensorDictBase, tile_size: int | None) -> np.ndarray:
+    """Return frames, uint8 [B, C, H, W]: of all rows of a grid, else of the rows in ``shown``."""
+    if not isinstance(env, PickAndPlaceEnv):
+        return shown[keys.PIXELS].cpu().numpy()
+    return env.render(tile_size or env.tile_size).transpose(0, 3, 1, 2)

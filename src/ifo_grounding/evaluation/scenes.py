@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from ifo_grounding import keys, modules
 from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
-from ifo_grounding.episodes import Policy
+from ifo_grounding.episodes import Outcomes, Policy, play
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
 
@@ -23,152 +23,118 @@ MAX_STEPS = 40
 MAX_STEPS_OF_OTHERS = 1000
 """Most actions in an environment that is given, whose episodes end by themselves mostly."""
 
+Player = Callable[..., Outcomes]
+"""Plays an environment from what its reset returned; takes ``on_step`` as :func:`play` does."""
+PlayBatch = Callable[[Player, EnvBase, TensorDictBase], Iterable[Tensor]]
+"""Plays a batch of scenes and returns columns, [B, ...] each."""
+
 
 def device_of(module: object) -> torch.device:
     """Return the device of a module's first parameter or buffer, else the CPU."""
     return modules.device_of(module) or torch.device("cpu")
 
 
-@contextlib.contextmanager
-def seeded(seed: int, device: torch.device) -> Iterator[None]:
-    """Seed torch's global generators within a block and restore them after it."""
-    cuda = [device] if device.type == "cuda" else []
-    with torch.random.fork_rng(devices=cuda):
-        torch.manual_seed(seed)
-        yield
-
-
-def most_steps(env_or_task: EnvBase | str, max_steps: int | None) -> int:
-    """Return the most actions of an episode: as said, or those of a task or of an environment."""
-    if max_steps is not None:
-        return at_least_one("max_steps", max_steps)
-    return MAX_STEPS if isinstance(env_or_task, str) else MAX_STEPS_OF_OTHERS
-
-
-class SceneHash:
-    """Hash of the first frames and instructions of scenes, whatever batches they come in."""
-
-    def __init__(self) -> None:
-        self._pixels, self._instructions = hashlib.blake2b(), hashlib.blake2b()
-
-    def update(self, start: TensorDictBase, scenes: int) -> None:
-        """Add the first ``scenes`` rows of what a reset returned."""
-        flat = start.reshape(start.batch_size.numel())[:scenes]
-        self._pixels.update(flat[keys.PIXELS].cpu().contiguous().numpy().tobytes())
-        instructions = flat[keys.INSTRUCTION].cpu().contiguous().numpy()
-        self._instructions.update(instructions.astype("<i8").tobytes())
-
-    def hexdigest(self) -> str:
-        """Return 16 hexadecimal digits."""
-        both = self._pixels.digest() + self._instructions.digest()
-        return hashlib.blake2b(both, digest_size=8).hexdigest()
-
-
-def scene_batches(
+def play_scenes(
+    policy: Policy,
     env_or_task: EnvBase | str,
     numbers: Sequence[int],
+    play_batch: PlayBatch,
     *,
-    seed: int,
-    stream: str,
-    batch_size: int,
-    device: torch.device,
-    max_steps: int = MAX_STEPS,
+    mode: str = "greedy",
+    seed: int = 0,
+    stream: str = "evaluation",
+    batch_size: int = 1000,
+    device: torch.device | str | None = None,
+    max_steps: int | None = None,
+    purpose: str = "success",
     **env_options: Any,
-) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
-    """Yield environments reset to the scenes with the given numbers, batch by batch.
+) -> tuple[list[Tensor], str]:
+    """Play one episode per scene, batch by batch, in eval mode and without gradients.
 
     Args:
-        env_or_task: name of a task, or an instructed environment to use as it is, seeded anew so
-            that its scenes depend on ``seed`` and nothing else. Those of
-            :func:`~ifo_grounding.envs.from_gymnasium` have numbers; of others, which are seeded
-            before each batch, there are only the first ones.
-        numbers: which scenes of the stream.
-        seed: of the stream.
-        stream: ``training``, ``validation`` or ``evaluation``.
-        batch_size: rows of an environment made here.
-        device: of an environment made here.
-        max_steps: of an environment made here.
-        env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`.
+        policy: writes an action.
+        env_or_task: as for :func:`~ifo_grounding.evaluation.success_rate`, and so are the arguments
+            that are not named here.
+        numbers: which scenes of the stream. Environments that are neither the library's nor of
+            :func:`~ifo_grounding.envs.from_gymnasium` are seeded before each batch and have only
+            the first ones, ``range(n)``.
+        play_batch: plays the scenes of one batch.
+        purpose: names the random numbers that sampled actions are drawn with.
 
-    Yields:
-        The environment, what its reset returned, and how many of its rows count.
+    Returns:
+        The columns of ``play_batch``, of all scenes [N, ...] on the CPU, and the hash of the
+        scenes' first frames and instructions.
     """
-    env: EnvBase
     if isinstance(env_or_task, str):
-        rows = min(at_least_one("batch_size", batch_size), len(numbers))
-        env = PickAndPlaceEnv(
+        limit = MAX_STEPS if max_steps is None else at_least_one("max_steps", max_steps)
+        env: EnvBase = PickAndPlaceEnv(
             env_or_task,
-            num_envs=rows,
-            device=device,
+            num_envs=min(at_least_one("batch_size", batch_size), len(numbers)),
+            device=device_of(policy) if device is None else torch.device(device),
             seed=seed,
             stream=stream,
-            max_steps=max_steps,
+            max_steps=limit,
             **env_options,
         )
+        batches = _numbered(env, numbers)
     else:
-        env, rows = env_or_task, env_or_task.batch_size.numel()
-        _check_given(env, env_options)
-        if not isinstance(env, GymnasiumEnv):
-            if list(numbers) != [*range(len(numbers))]:
-                raise UserError(
-                    "this environment cannot be reset to a scene by its number: ask for the first "
-                    "ones, range(n), name a task, or use from_gymnasium"
-                )
-            yield from _batches_of(env, len(numbers), seed, stream)
-            return
+        limit = MAX_STEPS_OF_OTHERS if max_steps is None else at_least_one("max_steps", max_steps)
+        batches = _batches_of(env_or_task, numbers, seed, stream, env_options)
+    player = functools.partial(play, policy, mode=mode, max_steps=limit)
+    parts, pixels, instructions = [], hashlib.blake2b(), hashlib.blake2b()
+    for batch, (env, start, count) in enumerate(batches):
+        first = start.reshape(start.batch_size.numel())[:count]
+        pixels.update(first[keys.PIXELS].cpu().numpy().tobytes())
+        instructions.update(first[keys.INSTRUCTION].cpu().numpy().astype("<i8").tobytes())
+        home = start[keys.PIXELS].device
+        cuda = [home] if home.type == "cuda" else []
+        with modules.evaluating(policy), torch.random.fork_rng(devices=cuda):
+            torch.manual_seed(derive(seed, purpose, mode, batch))
+            parts.append([column[:count].cpu() for column in play_batch(player, env, start)])
+    both = pixels.digest() + instructions.digest()
+    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
+    return columns, hashlib.blake2b(both, digest_size=8).hexdigest()
+
+
+def _numbered(
+    env: EnvBase, numbers: Sequence[int]
+) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
+    """Yield an environment, what its reset to scenes returned, and how many of its rows count."""
+    rows = env.batch_size.numel()
+    for chosen in torch.as_tensor(numbers, device=env.device).split(rows):
+        # The last batch is filled up with copies of its first scene, which do not count.
+        padded = torch.cat([chosen, chosen[:1].expand(rows - len(chosen))])
+        scene = TensorDict({keys.SCENE: padded.unsqueeze(-1)}, batch_size=[rows], device=env.device)
+        yield env, env.reset(scene), len(chosen)
+
+
+def _batches_of(
+    env: EnvBase, numbers: Sequence[int], seed: int, stream: str, env_options: dict[str, Any]
+) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
+    """Yield batches as :func:`_numbered` does, in an environment that is given."""
+    _check_given(env, env_options)
+    if isinstance(env, GymnasiumEnv):
         check_choice("stream", stream, STREAMS)
         kept, env.stream = env.stream, stream
         env.set_seed(seed)
         try:
-            yield from _numbered(env, rows, torch.as_tensor(numbers, device=device))
+            yield from _numbered(env, numbers)
         finally:
             env.stream = kept
         return
-    yield from _numbered(env, rows, torch.as_tensor(numbers, device=device))
-
-
-def _numbered(
-    env: EnvBase, rows: int, wanted: Tensor
-) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
-    for chosen in wanted.split(rows):
-        # The last batch is filled up with copies of its first scene, which do not count.
-        padded = torch.cat([chosen, chosen[:1].expand(rows - len(chosen))])
-        scene = TensorDict(
-            {keys.SCENE: padded.unsqueeze(-1)}, batch_size=[rows], device=wanted.device
+    if list(numbers) != [*range(len(numbers))]:
+        raise UserError(
+            "this environment cannot be reset to a scene by its number: ask for the first ones, "
+            "range(n), name a task, or use from_gymnasium"
         )
-        yield env, env.reset(scene), len(chosen)
-
-
-def play_scenes(
-    policy: Policy,
-    batches: Iterable[tuple[EnvBase, TensorDictBase, int]],
-    seed: int,
-    mode: str,
-    play_batch: Callable[[EnvBase, TensorDictBase], Iterable[Tensor]],
-) -> tuple[list[Tensor], str]:
-    """Play batch after batch in eval mode, each with its own seed.
-
-    Args:
-        policy: which plays.
-        batches: from :func:`scene_batches`.
-        seed: of the actions, where sampled.
-        mode: ``greedy`` or ``sampled``.
-        play_batch: plays an environment from what its reset returned; tensors of its rows [B, ...].
-
-    Returns:
-        What ``play_batch`` returned, of all scenes [N, ...] on the CPU, and the scenes' hash.
-    """
-    scenes, parts = SceneHash(), []
-    for number, (env, start, count) in enumerate(batches):
-        scenes.update(start, count)
-        device = start[keys.PIXELS].device
-        with modules.evaluating(policy), seeded(derive(seed, "success", mode, number), device):
-            parts.append([column[:count].cpu() for column in play_batch(env, start)])
-    return [torch.cat(column) for column in zip(*parts, strict=True)], scenes.hexdigest()
+    rows = env.batch_size.numel()
+    for batch, first in enumerate(range(0, len(numbers), rows)):
+        env.set_seed(derive(seed, stream, batch) % 2**31)
+        yield env, env.reset(), min(rows, len(numbers) - first)
 
 
 def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
-    """Refuse an environment that cannot be judged as asked for."""
+    """Refuse an environment in which success cannot be measured."""
     if env_options:
         raise UserError(
             f"options {sorted(env_options)} are for an environment made from a task's name: "
@@ -180,28 +146,14 @@ def _check_given(env: EnvBase, env_options: dict[str, Any]) -> None:
             "instructions: evaluate in one with instructed=True"
         )
     shown = env.observation_spec.keys(True, True)
-    if keys.INSTRUCTION not in shown:
-        raise UserError(
-            "success needs an environment that shows its instruction under "
-            f"{keys.INSTRUCTION!r}: make it with instructed=True, or rename its entry with "
-            "torchrl.envs.RenameTransform"
-        )
-    if keys.PIXELS not in shown:
-        raise UserError(
-            f"success needs an environment that shows its image under {keys.PIXELS!r}: rename its "
-            "entry with torchrl.envs.RenameTransform"
-        )
+    for key, what in ((keys.INSTRUCTION, "instruction"), (keys.PIXELS, "image")):
+        if key not in shown:
+            raise UserError(
+                f"success needs an environment that shows its {what} under {key!r}: make it with "
+                "instructed=True, or rename its entry with torchrl.envs.RenameTransform"
+            )
     if len(env.reward_keys) > 1 and keys.REWARD not in env.reward_keys:
         raise UserError(
             f"the environment pays {env.reward_keys}: success is seen from the true reward, named "
             f"{keys.REWARD!r}"
         )
-
-
-def _batches_of(
-    env: EnvBase, count: int, seed: int, stream: str
-) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
-    rows = env.batch_size.numel()
-    for batch, first in enumerate(range(0, count, rows)):
-        env.set_seed(derive(seed, stream, batch) % 2**31)
-        yield env, env.reset(), min(rows, count - first)

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ifo_grounding.episodes import MODES, Outcomes, Policy, play
+from ifo_grounding.episodes import MODES, Policy
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.evaluation.scenes import device_of, most_steps, play_scenes, scene_batches
-from ifo_grounding.stats import Difference, Rate, paired_difference, wilson
+from ifo_grounding.evaluation.scenes import play_scenes
+from ifo_grounding.stats import Described, Difference, Rate, paired_difference, wilson
 
 
 @dataclass(frozen=True)
-class SuccessResult:
+class SuccessResult(Described):
     """Success on fixed scenes, one episode each."""
 
     rate: Rate
@@ -39,18 +37,8 @@ class SuccessResult:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, without the outcome of every scene."""
-        values = {
-            "rate": self.rate.as_dict(),
-            "stopped": self.stopped.as_dict(),
-            "mean_length": float(self.lengths.double().mean()),
-            "scenes": self.scenes,
-            "mode": self.mode,
-        }
-        return values if self.sampled is None else {**values, "sampled": self.sampled.as_dict()}
-
-    def __str__(self) -> str:
-        """Return the rate with its interval."""
-        return str(self.rate)
+        values = {**super().as_dict(), "mean_length": float(self.lengths.double().mean())}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 def success_rate(
@@ -90,7 +78,8 @@ def success_rate(
             ``tile_size`` and ``split``.
 
     Raises:
-        UserError: on an unknown name, no episodes, or an environment without instructions.
+        UserError: on an unknown name, no episodes, an environment without instructions, or a policy
+            that writes no action.
 
     >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
     >>> result = success_rate(stop, "move", episodes=50)
@@ -98,32 +87,18 @@ def success_rate(
     0.0% [0.0, 7.1] (n=50) 1
     """
     check_choice("mode", mode, [*MODES, "both"])
-    episodes = at_least_one("episodes", episodes)
-    options = {"seed": seed, "stream": stream, "batch_size": batch_size, **env_options}
-    options["max_steps"] = limit = most_steps(env_or_task, max_steps)
-    options["device"] = torch.device(device) if device is not None else device_of(policy)
-
-    def measure(how: str) -> SuccessResult:
-        return _measure(
-            policy, scene_batches(env_or_task, range(episodes), **options), how, seed, limit
-        )
-
+    options: dict[str, Any] = {"seed": seed, "stream": stream, "batch_size": batch_size}
+    options |= {"device": device, "max_steps": max_steps, **env_options}
     if mode == "both":
-        return replace(measure("greedy"), sampled=measure("sampled"))
-    return measure(mode)
-
-
-def _measure(
-    policy: Policy,
-    batches: Iterator[tuple[EnvBase, TensorDictBase, int]],
-    mode: str,
-    seed: int,
-    max_steps: int,
-) -> SuccessResult:
-    def play_batch(env: EnvBase, start: TensorDictBase) -> Outcomes:
-        return play(policy, env, start, mode=mode, max_steps=max_steps)
-
-    (success, lengths, stopped), scenes = play_scenes(policy, batches, seed, mode, play_batch)
+        greedy, sampled = (
+            success_rate(policy, env_or_task, mode=each, episodes=episodes, **options)
+            for each in MODES
+        )
+        return replace(greedy, sampled=sampled)
+    numbers = range(at_least_one("episodes", episodes))
+    (success, lengths, stopped), scenes = play_scenes(
+        policy, env_or_task, numbers, lambda play, *place: play(*place), mode=mode, **options
+    )
     return SuccessResult(
         rate=wilson(int(success.sum()), len(success)),
         stopped=wilson(int(stopped.sum()), len(success)),

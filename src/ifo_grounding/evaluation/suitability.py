@@ -1,19 +1,20 @@
-"""Whether the instruction module chooses instructions that suit a state (paper, Table 3)."""
+"""Whether the instruction classifier chooses instructions that suit a state (paper, Table 3)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
+from scipy import stats as scipy_stats
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, whole
 from ifo_grounding.evaluation.scenes import MAX_STEPS, device_of
 from ifo_grounding.seeding import generator
-from ifo_grounding.stats import Estimate, Rate, auc, reliability, wilson
+from ifo_grounding.stats import Described, Estimate, Rate, auc, reliability, wilson
 from ifo_grounding.tasks.goals import REASONS, Goal, verdict
 from ifo_grounding.tasks.grammar import FIELDS, grammar
 from ifo_grounding.tasks.scenes import SceneOptions
@@ -24,11 +25,11 @@ from ifo_grounding.world import WorldState, render
 
 NOT_SERVED = -1
 SERVABLE_STATES = 500
-"""States whose whole pool the oracle judges."""
+"""States for which the oracle goes through the whole pool."""
 
 
-class Judged(NamedTuple):
-    """What was chosen for some states, and the oracle's verdict."""
+class CheckedChoices(NamedTuple):
+    """What was chosen for some states, and what is wrong with it."""
 
     state: WorldState
     """The states, [B]."""
@@ -41,7 +42,7 @@ class Judged(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SuitabilityResult:
+class SuitabilityResult(Described):
     """How good the chosen instructions are, and how good the threshold is."""
 
     rate: Rate
@@ -70,18 +71,6 @@ class SuitabilityResult:
     """Of random pairs, by bins of the probability that they are said to have: its mean, and the
     share that is suitable. Equal where the module is calibrated."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        names = ("rate", "served", "servable", "precision", "recall", "base_rate", "auc")
-        intervals = {name: getattr(self, name).as_dict() for name in names}
-        bits = {"entropy": self.entropy, "most_entropy": self.most_entropy}
-        bins = [[said, rate.as_dict()] for said, rate in self.reliability]
-        return {**intervals, **bits, "reliability": bins, "errors": dict(self.errors)}
-
-    def __str__(self) -> str:
-        """Return the suitable rate with its interval."""
-        return str(self.rate)
-
 
 def suitable_rate(
     classifier: TensorDictModuleBase,
@@ -100,7 +89,7 @@ def suitable_rate(
     max_steps: int = MAX_STEPS,
     **scene_options: Any,
 ) -> SuitabilityResult:
-    """Let the instruction module choose for fresh simulator states, and judge it by the oracle.
+    """Let the instruction classifier choose for fresh simulator states, and ask the oracle.
 
     Choices are made by :func:`~ifo_grounding.transforms.choose_instructions`, as in
     self-examination, except that each state is asked once: states that it does not serve count in
@@ -118,7 +107,7 @@ def suitable_rate(
         seed: of the states and the choices.
         stream: ``evaluation`` for results, ``validation`` for choices.
         tile_size: pixels along one side of a cell.
-        batch_size: states judged together.
+        batch_size: states examined together.
         max_steps: a goal that needs more actions is unachievable.
         scene_options: of :class:`~ifo_grounding.tasks.SceneOptions`, such as ``layout``.
 
@@ -134,32 +123,23 @@ def suitable_rate(
     """
     if whole("pairs_per_state", pairs_per_state) < 0:
         raise UserError(f"pairs_per_state must not be negative, got {pairs_per_state}")
-    tokens, goals = read_pool(task, pool)
-    device = device_of(classifier)
-    scorer = PoolScorer(classifier, tokens.to(device))
-    draw = generator(seed, "suitability", stream)
+    states, batch_size = at_least_one("states", states), at_least_one("batch_size", batch_size)
+    examiner = _Examiner(
+        classifier, task, pool, seed, stream, tile_size, max_steps, **scene_options
+    )
     chosen, verdicts, pairs = [], [], []
     servable: list[bool] = []
-    for state, pixels in _fresh_states(
-        task, states, seed, stream, tile_size, batch_size, device, max_steps, scene_options
-    ):
-        index, score = choose_instructions(
-            scorer,
-            None,
-            pixels,
-            threshold=threshold,
-            candidates=candidates,
-            choose=choose,
-            generator=draw,
+    for numbers in torch.arange(states).split(batch_size):
+        state, pixels = examiner.fresh(numbers)
+        checked = examiner.choices(
+            state, pixels, threshold=threshold, candidates=candidates, choose=choose
         )
-        judged = _judge(state, index, score, goals, max_steps)
+        chosen.append(checked.chosen.cpu())
+        verdicts.append(checked.verdict.cpu())
         if left := SERVABLE_STATES - len(servable):
-            servable += _servable(state[:left], goals, max_steps)
-        chosen.append(judged.chosen.cpu())
-        verdicts.append(judged.verdict.cpu())
+            servable += examiner.servable(state[:left])
         if pairs_per_state:
-            random = torch.randint(len(tokens), (len(pixels), pairs_per_state), generator=draw)
-            pairs.append(_score_pairs(scorer, state, pixels, random.to(device), goals, max_steps))
+            pairs.append(examiner.random_pairs(state, pixels, pairs_per_state))
     index, found = torch.cat(chosen), torch.cat(verdicts)
     served = found != NOT_SERVED
     n_served, n_suitable = int(served.sum()), int((found == 0).sum())
@@ -168,13 +148,13 @@ def suitable_rate(
         served=wilson(n_served, states),
         servable=wilson(sum(servable), len(servable)),
         errors={REASONS[kind]: int((found == kind).sum()) for kind in range(1, len(REASONS))},
-        entropy=entropy_bits(_goal_numbers(goals)[index[served]]),
-        most_entropy=entropy_bits(_goal_numbers(goals).unique()),
+        entropy=_entropy_bits(examiner.goal_numbers[index[served]]),
+        most_entropy=_entropy_bits(examiner.goal_numbers.unique()),
         **_threshold_quality(pairs, threshold),
     )
 
 
-def judged_choices(
+def checked_choices(
     classifier: TensorDictModuleBase,
     task: str,
     pool: Tensor | Sequence[str],
@@ -183,31 +163,74 @@ def judged_choices(
     threshold: float = 0.8,
     candidates: int = 64,
     choose: str = "random",
-    seed: int = 0,
-    stream: str = "evaluation",
-    tile_size: int = 8,
-    max_steps: int = MAX_STEPS,
-    **scene_options: Any,
-) -> Judged:
+    **options: Any,
+) -> CheckedChoices:
     """Return what is chosen for a few fresh states; arguments as :func:`suitable_rate`."""
-    tokens, goals = read_pool(task, pool)
-    device = device_of(classifier)
-    scorer = PoolScorer(classifier, tokens.to(device))
-    state, pixels = next(
-        _fresh_states(
-            task, states, seed, stream, tile_size, states, device, max_steps, scene_options
+    examiner = _Examiner(classifier, task, pool, **options)
+    fresh = examiner.fresh(torch.arange(at_least_one("states", states)))
+    return examiner.choices(*fresh, threshold=threshold, candidates=candidates, choose=choose)
+
+
+class _Examiner:
+    """Lets a classifier choose for fresh states, and asks the oracle."""
+
+    def __init__(
+        self,
+        classifier: TensorDictModuleBase,
+        task: str,
+        pool: Tensor | Sequence[str],
+        seed: int = 0,
+        stream: str = "evaluation",
+        tile_size: int = 8,
+        max_steps: int = MAX_STEPS,
+        **scene_options: Any,
+    ) -> None:
+        self.device, self.tile_size, self.max_steps = device_of(classifier), tile_size, max_steps
+        tokens, goals = read_pool(task, pool)
+        self.goals = goals.to(self.device)
+        fields = torch.stack([getattr(goals, name) for name in FIELDS], dim=-1)
+        self.goal_numbers = fields.unique(dim=0, return_inverse=True)[1]
+        """Equal goals of the pool share a number, int64 [N], on the CPU."""
+        self.scorer = PoolScorer(classifier, tokens.to(self.device))
+        self.draw = generator(seed, "suitability", stream)
+        options = SceneOptions(
+            task=task, instructed=False, stream=stream, max_steps=max_steps, **scene_options
         )
-    )
-    index, score = choose_instructions(
-        scorer,
-        None,
-        pixels,
-        threshold=threshold,
-        candidates=candidates,
-        choose=choose,
-        generator=generator(seed, "suitability", stream),
-    )
-    return _judge(state, index, score, goals, max_steps)
+        self.scenes = SceneStream(options, seed, self.device)
+
+    def fresh(self, numbers: Tensor) -> tuple[WorldState, Tensor]:
+        """Return states without instructions, by their numbers [B], and their pictures."""
+        state = self.scenes.scenes(numbers.to(self.device)).state
+        return state, render(state, self.tile_size)
+
+    def choices(self, state: WorldState, pixels: Tensor, **options: Any) -> CheckedChoices:
+        """Let the classifier choose."""
+        index, score = choose_instructions(
+            self.scorer, None, pixels, generator=self.draw, **options
+        )
+        found = verdict(state, self.goals[index.clamp_min(0)], self.max_steps)
+        return CheckedChoices(state, index, score, torch.where(index < 0, NOT_SERVED, found))
+
+    def servable(self, state: WorldState) -> list[bool]:
+        """Say for each state [B] whether any goal of the pool suits it."""
+        rows = {number: row for row, number in enumerate(self.goal_numbers.tolist())}
+        found = torch.zeros(len(state), dtype=torch.bool, device=self.device)
+        for row in rows.values():
+            goal = self.goals[row : row + 1].expand(len(state))
+            found |= verdict(state, goal, self.max_steps) == 0
+        return found.tolist()
+
+    def random_pairs(
+        self, state: WorldState, pixels: Tensor, per_state: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return logits [B, K] of random pairs, and whether they are suitable, bool [B, K]."""
+        index = torch.randint(len(self.goals), (len(pixels), per_state), generator=self.draw)
+        index = index.to(self.device)
+        truth = [
+            verdict(state, self.goals[column], self.max_steps) == 0 for column in index.unbind(1)
+        ]
+        logits = self.scorer.score(self.scorer.encode(pixels), index)
+        return logits.cpu(), torch.stack(truth, 1).cpu()
 
 
 def read_pool(task: str, pool: Tensor | Sequence[str]) -> tuple[Tensor, Goal]:
@@ -219,70 +242,10 @@ def read_pool(task: str, pool: Tensor | Sequence[str]) -> tuple[Tensor, Goal]:
     return tokens, grammar(task).parse_tokens(tokens)
 
 
-def entropy_bits(values: Tensor) -> float:
-    """Return the entropy of the distribution of values, in bits.
-
-    >>> entropy_bits(torch.tensor([3, 3, 7, 9]))
-    1.5
-    """
-    if not len(values):
-        return 0.0
-    share = values.unique(return_counts=True)[1].double() / len(values)
-    return abs(float(-(share * share.log2()).sum()))
-
-
-def _fresh_states(
-    task: str,
-    states: int,
-    seed: int,
-    stream: str,
-    tile_size: int,
-    batch_size: int,
-    device: torch.device,
-    max_steps: int,
-    scene_options: dict[str, Any],
-) -> Iterator[tuple[WorldState, Tensor]]:
-    """Yield states without instructions, in batches, with their pictures."""
-    options = SceneOptions(
-        task=task, instructed=False, stream=stream, max_steps=max_steps, **scene_options
-    )
-    scenes = SceneStream(options, seed, device)
-    states, batch_size = at_least_one("states", states), at_least_one("batch_size", batch_size)
-    for numbers in torch.arange(states, device=device).split(batch_size):
-        state = scenes.scenes(numbers).state
-        yield state, render(state, tile_size)
-
-
-def _judge(state: WorldState, index: Tensor, score: Tensor, goals: Goal, max_steps: int) -> Judged:
-    goals = goals.to(index.device)
-    found = verdict(state, goals[index.clamp_min(0)], max_steps)
-    return Judged(state, index, score, torch.where(index < 0, NOT_SERVED, found))
-
-
-def _servable(state: WorldState, goals: Goal, max_steps: int) -> list[bool]:
-    """Say for each state [B] whether any goal of the pool suits it."""
-    numbers = _goal_numbers(goals)
-    rows = torch.arange(len(numbers), device=numbers.device)
-    distinct = rows.new_zeros(int(numbers.max()) + 1).scatter_(0, numbers, rows)
-    found = torch.zeros(len(state), dtype=torch.bool, device=state.arm.device)
-    for row in distinct.tolist():
-        goal = goals[row : row + 1].to(found.device).expand(len(state))
-        found |= verdict(state, goal, max_steps) == 0
-    return found.tolist()
-
-
-def _score_pairs(
-    scorer: PoolScorer,
-    state: WorldState,
-    pixels: Tensor,
-    index: Tensor,
-    goals: Goal,
-    max_steps: int,
-) -> tuple[Tensor, Tensor]:
-    """Logits [B, K] of random pairs, and whether they are suitable, bool [B, K]."""
-    goals = goals.to(index.device)
-    truth = [verdict(state, goals[column], max_steps) == 0 for column in index.unbind(1)]
-    return scorer.score(scorer.encode(pixels), index).cpu(), torch.stack(truth, 1).cpu()
+def _entropy_bits(values: Tensor) -> float:
+    """Return the entropy of the distribution of values, in bits."""
+    counts = values.unique(return_counts=True)[1]
+    return float(scipy_stats.entropy(counts, base=2)) if len(counts) else 0.0
 
 
 def _threshold_quality(pairs: list[tuple[Tensor, Tensor]], threshold: float) -> dict[str, Any]:
@@ -295,17 +258,6 @@ def _threshold_quality(pairs: list[tuple[Tensor, Tensor]], threshold: float) -> 
         "precision": wilson(hits, int(above.sum())),
         "recall": wilson(hits, int(truth.sum())),
         "base_rate": wilson(int(truth.sum()), truth.numel()),
-        "auc": auc(
-            logits[truth].numpy(),
-            logits[~truth].numpy(),
-            positive_groups=group[truth].numpy(),
-            negative_groups=group[~truth].numpy(),
-        ),
+        "auc": auc(logits.numpy(), truth.numpy(), group.numpy()),
         "reliability": reliability(logits.sigmoid().numpy(), truth.numpy()),
     }
-
-
-def _goal_numbers(goals: Goal) -> Tensor:
-    """Number goals so that equal ones share a number, int64 [N]."""
-    fields = torch.stack([getattr(goals, name) for name in FIELDS], dim=-1)
-    return fields.unique(dim=0, return_inverse=True)[1]

@@ -9,7 +9,6 @@ from ifo_grounding.report.casestudy import (
     improved_episodes,
     instruction_cases,
 )
-from ifo_grounding.report.evidence import evidence_figure
 from ifo_grounding.report.metrics import read_metrics
 from ifo_grounding.report.page import write_report
 from ifo_grounding.report.plots import (
@@ -33,7 +32,6 @@ __all__ = [
     "changed_scenes",
     "compared_rates",
     "confusion",
-    "evidence_figure",
     "figure_png",
     "format_cell",
     "gallery",

@@ -17,7 +17,7 @@ from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.recording import Episode, record_episodes
 from ifo_grounding.evaluation.success import SuccessResult
-from ifo_grounding.evaluation.suitability import NOT_SERVED, judged_choices, read_pool
+from ifo_grounding.evaluation.suitability import NOT_SERVED, checked_choices, read_pool
 from ifo_grounding.report.drawing import BAD, GOOD, Cell, Sheet
 from ifo_grounding.tasks.goals import REASONS
 from ifo_grounding.tasks.vocabulary import VOCABULARY
@@ -65,7 +65,7 @@ def instruction_cases(
         picture_tile_size: pixels along one side of a cell in the pictures.
         options: of :func:`~ifo_grounding.evaluation.suitable_rate`, such as ``threshold``.
     """
-    judged = judged_choices(classifier, task, pool, states=search, **options)
+    judged = checked_choices(classifier, task, pool, states=search, **options)
     tokens, _ = read_pool(task, pool)
     wrong = (judged.verdict > 0).nonzero().squeeze(-1).tolist()
     right = (judged.verdict == 0).nonzero().squeeze(-1).tolist()

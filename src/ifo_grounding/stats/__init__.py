@@ -1,22 +1,21 @@
-"""Rates, differences and areas under the ROC curve, each with its interval.
+"""Rates, differences and areas under the ROC curve, each with its 95% interval.
 
 Numbers go in and out as numpy arrays or anything that becomes one. Everything that resamples is a
 function of its ``seed``.
 """
 
 from ifo_grounding.stats.association import auc, correlation
-from ifo_grounding.stats.calibration import reliability
 from ifo_grounding.stats.rates import (
-    RESAMPLES,
     holm,
     paired_difference,
+    reliability,
     two_level_bootstrap,
     wilson,
 )
-from ifo_grounding.stats.results import Difference, Estimate, Rate
+from ifo_grounding.stats.results import Described, Difference, Estimate, Rate
 
 __all__ = [
-    "RESAMPLES",
+    "Described",
     "Difference",
     "Estimate",
     "Rate",

@@ -7,18 +7,19 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats as scipy_stats
+from scipy.stats import beta, binomtest, t
 
 from ifo_grounding.errors import UserError, at_least_one
-from ifo_grounding.stats.results import Difference, Rate, check_confidence
+from ifo_grounding.stats.results import CONFIDENCE, Difference, Rate
 
 RESAMPLES = 4000
 """Bootstrap replicates unless told otherwise: bounds are stable to about a tenth of a width."""
+TAIL = (1 - CONFIDENCE) / 2
 FEW_CHANGES = 10
 """Scenes that changed, below which a bootstrap of differences is not trusted alone."""
 
 
-def wilson(successes: int, count: int, confidence: float = 0.95) -> Rate:
+def wilson(successes: int, count: int) -> Rate:
     """Return a rate with Wilson's score interval, right also near 0 and 1.
 
     Raises:
@@ -27,24 +28,54 @@ def wilson(successes: int, count: int, confidence: float = 0.95) -> Rate:
     >>> print(wilson(8, 10))
     80.0% [49.0, 94.3] (n=10)
     """
-    check_confidence(confidence)
     if not (0 <= successes <= count and successes % 1 == count % 1 == 0):
         raise UserError(f"successes must be 0..count, both whole, got {successes} of {count}")
     successes, count = int(successes), int(count)
     if count == 0:
         return Rate(math.nan, 0.0, 1.0, 0, 0, "wilson")
-    z = float(scipy_stats.norm.ppf(0.5 + confidence / 2))
-    rate = successes / count
-    shrink = 1.0 + z * z / count
-    centre = (rate + z * z / (2 * count)) / shrink
-    half = z / shrink * math.sqrt(rate * (1 - rate) / count + z * z / (4 * count * count))
-    low = 0.0 if successes == 0 else max(0.0, centre - half)
-    high = 1.0 if successes == count else min(1.0, centre + half)
-    return Rate(rate, low, high, successes, count, "wilson")
+    found = binomtest(successes, count)
+    interval = found.proportion_ci(CONFIDENCE, method="wilson")
+    low, high = float(interval.low), float(interval.high)
+    return Rate(successes / count, low, high, successes, count, "wilson")
+
+
+def reliability(
+    probabilities: ArrayLike, happened: ArrayLike, bins: int = 10
+) -> list[tuple[float, Rate]]:
+    """Compare probabilities with what happened, in bins of equal width (DeGroot, Fienberg 1983).
+
+    Args:
+        probabilities: what was predicted, in [0, 1], [N].
+        happened: what came true, bool [N].
+        bins: number of bins.
+
+    Returns:
+        For each bin that is not empty the mean probability and the share of what came true, with
+        Wilson's interval. The closer the two, the better calibrated.
+
+    Raises:
+        UserError: where the inputs do not fit together, or are no probabilities.
+
+    >>> [(said, rate.rate) for said, rate in reliability([0.25, 0.25, 0.75], [0, 1, 1], bins=2)]
+    [(0.25, 0.5), (0.75, 1.0)]
+    """
+    said = np.asarray(probabilities, dtype=np.float64).ravel()
+    true = np.asarray(happened, dtype=bool).ravel()
+    if len(said) != len(true):
+        raise UserError(f"{len(said)} probabilities do not fit {len(true)} outcomes")
+    bins = at_least_one("bins", bins)
+    if not ((said >= 0) & (said <= 1)).all():
+        raise UserError("probabilities must lie in [0, 1]")
+    places = np.minimum((said * bins).astype(int), bins - 1)
+    return [
+        (float(said[here].mean()), wilson(int(true[here].sum()), int(here.sum())))
+        for here in (places == place for place in range(bins))
+        if here.any()
+    ]
 
 
 def _resampled_means(
-    values: NDArray[np.float64], resamples: int, shared_scenes: bool, rng: np.random.Generator
+    values: NDArray[np.float64], resamples: int, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Means of resampled [seeds, scenes] values: seeds first, then scenes.
 
@@ -53,14 +84,10 @@ def _resampled_means(
     """
     seeds, scenes = values.shape
     seed = rng.integers(seeds, size=(resamples, seeds))
-    if shared_scenes:
-        patterns, counts = np.unique(values, axis=1, return_counts=True)
-        drawn = rng.multinomial(scenes, counts / scenes, size=resamples)
-        by_seed = drawn @ patterns.T / scenes
-        return np.take_along_axis(by_seed, seed, axis=1).mean(1)
-    kinds = np.unique(values)
-    shares = (values[:, :, None] == kinds).mean(1)
-    return (rng.multinomial(scenes, shares[seed]) @ kinds / scenes).mean(1)
+    patterns, counts = np.unique(values, axis=1, return_counts=True)
+    drawn = rng.multinomial(scenes, counts / scenes, size=resamples)
+    by_seed = drawn @ patterns.T / scenes
+    return np.take_along_axis(by_seed, seed, axis=1).mean(1)
 
 
 def _as_matrix(outcomes: ArrayLike, name: str) -> NDArray[np.float64]:
@@ -74,42 +101,29 @@ def _as_matrix(outcomes: ArrayLike, name: str) -> NDArray[np.float64]:
     return values
 
 
-def two_level_bootstrap(
-    outcomes: ArrayLike,
-    *,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-    shared_scenes: bool = True,
-) -> Rate:
+def two_level_bootstrap(outcomes: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0) -> Rate:
     """Return the mean success over training seeds, with an interval that counts their spread.
 
-    Each replicate draws seeds with replacement, then scenes. The interval is a percentile interval,
-    widened to hold Wilson's of the pooled outcomes, so that it is never empty; where all outcomes
-    are the same, Wilson's of the different scenes. With few seeds it is too narrow, as every
-    bootstrap is: it knows of no spread but theirs.
+    Each replicate draws seeds with replacement, then scenes, the same for every seed. The interval
+    is a percentile interval, widened to hold Wilson's of the pooled outcomes, so that it is never
+    empty; where all outcomes are the same, Wilson's of the scenes. With few seeds it is too narrow,
+    as every bootstrap is: it knows of no spread but theirs.
 
     Args:
-        outcomes: successes, bool [seeds, scenes]; [scenes] is one seed.
-        confidence: coverage of the interval.
+        outcomes: successes, bool [seeds, scenes], column j the same scene for every seed; [scenes]
+            is one seed.
         resamples: number of replicates.
         seed: of the resampling.
-        shared_scenes: whether column j is the same scene for every seed (as evaluation scenes
-            are), so that scenes are drawn once per replicate rather than once per seed.
 
     >>> print(two_level_bootstrap([[1, 1, 0, 1], [1, 0, 0, 1]]).rate)
     0.625
     """
-    check_confidence(confidence)
     at_least_one("resamples", resamples)
     values = _as_matrix(outcomes, "outcomes")
-    rng = np.random.default_rng(seed)
-    means = _resampled_means(values, resamples, shared_scenes, rng)
-    tail = (1 - confidence) / 2
-    same = shared_scenes and values.min() == values.max()
-    different = values.shape[1] if same else values.size
-    least = wilson(round(different * float(values.mean())), different, confidence)
-    low, high = np.quantile(means, (tail, 1 - tail))
+    means = _resampled_means(values, resamples, np.random.default_rng(seed))
+    different = values.shape[1] if np.ptp(values) == 0 else values.size
+    least = wilson(round(different * float(values.mean())), different)
+    low, high = np.quantile(means, (TAIL, 1 - TAIL))
     return Rate(
         rate=float(values.mean()),
         low=min(float(low), least.low),
@@ -121,12 +135,7 @@ def two_level_bootstrap(
 
 
 def paired_difference(
-    before: ArrayLike,
-    after: ArrayLike,
-    *,
-    confidence: float = 0.95,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
+    before: ArrayLike, after: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0
 ) -> Difference:
     """Compare two policies on the same scenes.
 
@@ -142,7 +151,6 @@ def paired_difference(
     Args:
         before: successes of the first policy, bool [scenes] or [seeds, scenes].
         after: successes of the second on the same scenes, same shape.
-        confidence: coverage of the interval.
         resamples: number of replicates.
         seed: of the resampling.
 
@@ -153,7 +161,6 @@ def paired_difference(
     >>> difference.points, difference.better, difference.worse, difference.p_value
     (25.0, 1, 0, 1.0)
     """
-    check_confidence(confidence)
     at_least_one("resamples", resamples)
     first, second = _as_matrix(before, "before"), _as_matrix(after, "after")
     if first.shape != second.shape:
@@ -162,37 +169,21 @@ def paired_difference(
             f"{list(np.shape(before))} and {list(np.shape(after))}"
         )
     change = second - first
+    seeds = len(change)
     better, worse = int((change > 0).sum()), int((change < 0).sum())
-    tail = (1 - confidence) / 2
-    rng = np.random.default_rng(seed)
-    means = _resampled_means(change, resamples, True, rng)
-    low, high = (float(q) for q in np.quantile(means, (tail, 1 - tail)))
-    up, down = better / len(change), worse / len(change)  # of one seed
-    scenes = change.shape[1]
-    few, won, lost = (
-        others < FEW_CHANGES
-        for others in (better + worse, change.size - better, change.size - worse)
-    )
-    if few or won:
-        high = max(high, _exact_upper(up, scenes, tail) - down / scenes)
-    if few or lost:
-        low = min(low, up / scenes - _exact_upper(down, scenes, tail))
-    if won:
-        low = min(low, 1 - _exact_upper(scenes - up, scenes, tail) - down / scenes)
-    if lost:
-        high = max(high, up / scenes - 1 + _exact_upper(scenes - down, scenes, tail))
-    if len(change) == 1:
-        p_value = 1.0
-        if better + worse:
-            p_value = float(scipy_stats.binomtest(better, better + worse).pvalue)
+    means = _resampled_means(change, resamples, np.random.default_rng(seed))
+    bootstrap = np.quantile(means, (TAIL, 1 - TAIL))
+    exact = _exact_bounds(better, worse, *change.shape)
+    if seeds == 1:
+        p_value = float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
         method = "bootstrap over scenes, exact McNemar test"
     else:
         p_value = _t_test(change)
-        method = f"bootstrap over {len(change)} seeds and their scenes, t test over seeds"
+        method = f"bootstrap over {seeds} seeds and their scenes, t test over seeds"
     return Difference(
         points=100 * float(change.mean()),
-        low=100 * low,
-        high=100 * high,
+        low=100 * float(min([bootstrap[0], *exact])),
+        high=100 * float(max([bootstrap[1], *exact])),
         better=better,
         worse=worse,
         count=change.size,
@@ -201,9 +192,33 @@ def paired_difference(
     )
 
 
-def _exact_upper(count: float, of: int, tail: float) -> float:
-    """Return the upper bound of Clopper and Pearson's interval of a share."""
-    return 1.0 if count >= of else float(scipy_stats.beta.ppf(1 - tail, count + 1, of - count))
+def _exact_bounds(better: int, worse: int, seeds: int, scenes: int) -> list[float]:
+    """Return what a difference may be by exact intervals, where nearly all scenes fared alike.
+
+    That is where fewer than ten changed, or all but fewer than ten were won, or lost.
+    """
+    up, down, size = better / seeds, worse / seeds, seeds * scenes
+    few, won, lost = (
+        others < FEW_CHANGES for others in (better + worse, size - better, size - worse)
+    )
+    bounds = []
+    if few or won:
+        bounds.append(_exact_upper(up, scenes) - down / scenes)
+    if few or lost:
+        bounds.append(up / scenes - _exact_upper(down, scenes))
+    if won:
+        bounds.append(1 - _exact_upper(scenes - up, scenes) - down / scenes)
+    if lost:
+        bounds.append(up / scenes - 1 + _exact_upper(scenes - down, scenes))
+    return bounds
+
+
+def _exact_upper(count: float, of: int) -> float:
+    """Return the upper bound of Clopper and Pearson's interval of a share.
+
+    The count is a mean over seeds, which need not be whole as SciPy's ``binomtest`` has it.
+    """
+    return 1.0 if count >= of else float(beta.ppf(1 - TAIL, count + 1, of - count))
 
 
 def _t_test(change: NDArray[np.float64]) -> float:
@@ -220,8 +235,8 @@ def _t_test(change: NDArray[np.float64]) -> float:
             error = max(error, rest)
     error = math.sqrt(error)
     if not error:  # every scene fares alike with every seed
-        return float(scipy_stats.binomtest(scenes, scenes).pvalue) if change.mean() else 1.0
-    return float(2 * scipy_stats.t.sf(abs(change.mean()) / error, seeds - 1))
+        return float(binomtest(scenes, scenes).pvalue) if change.mean() else 1.0
+    return float(2 * t.sf(abs(change.mean()) / error, seeds - 1))
 
 
 def holm(p_values: Sequence[float] | ArrayLike) -> list[float]:

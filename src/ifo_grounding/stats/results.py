@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
-from ifo_grounding.errors import UserError
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+CONFIDENCE = 0.95
+"""Coverage of every interval."""
 
 
 def _digits(rate: float, width: float) -> int:
@@ -28,17 +25,35 @@ def _digits(rate: float, width: float) -> int:
     return 2 if rare < 0.0005 or width < 0.0015 else 1
 
 
-class _Described:
-    """Gives a result dataclass a form for JSON, undefined numbers as None."""
+class Described:
+    """Gives a result dataclass a form for JSON, and its first field, the headline, as its text."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as plain values for JSON; what is undefined becomes None."""
-        fields = asdict(self)  # type: ignore[call-overload]
-        return {k: _finite(v) if isinstance(v, float) else v for k, v in fields.items()}
+        """Return the fields as plain values; what is undefined becomes None, arrays are left out.
+
+        >>> Rate(math.nan, 0.0, 1.0, 0, 0).as_dict()["rate"] is None
+        True
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {k: _plain(v) for k, v in values.items() if not hasattr(v, "shape")}
+
+    def __str__(self) -> str:
+        """Return the headline with its interval."""
+        return str(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Described):
+        return value.as_dict()
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass(frozen=True)
-class Rate(_Described):
+class Rate(Described):
     """A share of successes with its interval; shares lie within 0..1.
 
     >>> print(Rate(0.973, 0.961, 0.982, successes=1946, count=2000, method="wilson"))
@@ -68,7 +83,7 @@ class Rate(_Described):
 
 
 @dataclass(frozen=True)
-class Estimate(_Described):
+class Estimate(Described):
     """A number other than a rate (an area, a correlation) with its interval.
 
     >>> print(Estimate(0.912, 0.9, 0.924, count=500, method="delong"))
@@ -94,7 +109,7 @@ class Estimate(_Described):
 
 
 @dataclass(frozen=True)
-class Difference(_Described):
+class Difference(Described):
     """What changed between two policies on the same scenes, in percentage points.
 
     >>> print(Difference(2.5, 1.0, 4.0, better=60, worse=10, count=2000, p_value=1e-9, method=""))
@@ -132,9 +147,3 @@ class Difference(_Described):
         digits = 2 if near_zero or self.high - self.low < 0.25 else 1
         points, low, high = (f"{x:+.{digits}f}" for x in (self.points, self.low, self.high))
         return f"{points} points [{low}, {high}] ({changed})"
-
-
-def check_confidence(confidence: float) -> None:
-    """Raise :class:`UserError` unless a confidence is a probability."""
-    if not 0.0 < confidence < 1.0:
-        raise UserError(f"confidence must lie between 0 and 1 (such as 0.95), got {confidence}")
