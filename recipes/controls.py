@@ -30,8 +30,17 @@ def continue_imitation(options: Options) -> dict:
         env = TransformedEnv(simulator_of(options, section.num_envs), transforms)
         held_out = held_out_accuracy(policy, aside, run, options)
         by_accuracy = adversarial_updates(reward, run, options) is not None
-        best = BestCheckpoint(env, policy, section, options.seed, held_out, by_accuracy)
-        best.look()  # phase 1 itself is the one to beat
+        best = BestCheckpoint(
+            env,
+            policy,
+            seed=options.seed,
+            episodes=section.select_episodes,
+            max_steps=section.max_steps,
+            margin=section.select_margin,
+            held_out=held_out_accuracy(policy, aside, run, options),
+            by_accuracy=adversarial_updates(reward, run, options) is not None,
+        )
+        best.measure()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)
         config = replace(config, validate_every=math.ceil(config.steps / config.iteration / looks))
     return learn(options, stage, ImitationLoss(policy), seen, config, CONTINUED, held_out=best)

@@ -63,7 +63,7 @@ def evaluate(options: Options) -> dict:
             file=sys.stderr,
         )
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
-    labels = (run.stage("label").result or {}).get("accuracy")
+    labels = run.record("label").get("result", {}).get("accuracy")
     results: dict[str, Any] = {"labels": labels} if labels else {}
     policies = {name: load_network(run, NAMES[name], "imitate", options) for name in there}
     measured = measured_success(policies, options)

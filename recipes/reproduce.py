@@ -198,7 +198,7 @@ def to_make(chain: list[Piece]) -> list[Piece]:
     """
     missing = [piece for piece in chain if not piece.file.exists()]
     bases = {piece.base for piece in missing if Run(piece.run).options() is None}
-    gone = {base for base in bases if base and Run(base).stage("evaluate").result is None}
+    gone = {base for base in bases if base and not Run(base).record("evaluate")}
     return [piece for piece in chain if piece in missing or piece.run in gone]
 
 

@@ -67,6 +67,7 @@ def examine(options: Options) -> dict:
         held_out=held_out_accuracy(policy, aside, run, options),
         adversarial=adversarial_updates(reward, run, options),
         checkpoint=stage.checkpoint,
+        checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
         callback=audit_callback(policy, reward, run, options),
         progress=shows_progress(options),

@@ -13,7 +13,7 @@ import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf, open_dict
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.seeding import STREAMS
 from ifo_grounding.training.run import LOGGERS
 from ifo_grounding.training.self_examination import SelfExaminationConfig
@@ -42,19 +42,6 @@ FEW = 1000
 """With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
 
 
-def within(low: float, high: float, **values: float | None) -> None:
-    """Raise :class:`UserError` unless every value lies within [low, high]; None passes."""
-    for name, value in values.items():
-        if value is not None and not low <= value <= high:
-            allowed = f"at least {low:g}" if high == float("inf") else f"within {low:g}..{high:g}"
-            raise UserError(f"{name} must be {allowed}, got {value:g}")
-
-
-def at_least(low: float, **values: float | None) -> None:
-    """Raise :class:`UserError` unless every value is ``low`` or more; None passes."""
-    within(low, float("inf"), **values)
-
-
 @dataclass
 class DemonstrationsConfig:
     """What is imitated."""
@@ -63,7 +50,7 @@ class DemonstrationsConfig:
     """How many demonstrations are recorded, or read of those in ``recorded``."""
 
     def __post_init__(self) -> None:
-        at_least(1, n=self.n)
+        check_range(self, "n", least=1)
 
 
 @dataclass
@@ -80,8 +67,9 @@ class TransitionsConfig:
     """Leave out steps other than stops that change nothing: any action could have been theirs."""
 
     def __post_init__(self) -> None:
-        at_least(1, n=self.n, num_envs=self.num_envs)
-        within(0, 1, stop_probability=self.stop_probability)
+        check_numbers(self)
+        check_range(self, "n", "num_envs", least=1)
+        check_range(self, "stop_probability", least=0, most=1)
 
 
 @dataclass
@@ -104,10 +92,10 @@ class ImitateConfig(FitConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(1, trials=self.trials, trial_steps=self.trial_steps)
-        at_least(0, trial_halvings=self.trial_halvings, context=self.context)
-        within(0, 1, words_from=self.words_from)
-        within(0, 0.999, held_out=self.held_out)
+        check_range(self, "trials", "trial_steps", least=1)
+        check_range(self, "trial_halvings", "context", least=0)
+        check_range(self, "words_from", least=0, most=1)
+        check_range(self, "held_out", least=0, most=0.999)
 
 
 @dataclass
@@ -148,11 +136,10 @@ class InstructionConfig(FitConfig):
         super().__post_init__()
         check_choice("choose", self.choose, ("random", "best"))
         check_choice("unlabelled", self.unlabelled, ("removal", "mixture"))
-        counts = {"candidates": self.candidates, "negatives": self.negatives}
-        at_least(1, **counts, trials=self.trials, trial_steps=self.trial_steps)
-        at_least(0, contrast=self.contrast, fresh_states=self.fresh_states)
-        within(0, 1, removal_warmup=self.removal_warmup)
-        within(0, 0.999, threshold=self.threshold, near=self.near, removal_rate=self.removal_rate)
+        check_range(self, "candidates", "negatives", "trials", "trial_steps", least=1)
+        check_range(self, "contrast", "fresh_states", least=0)
+        check_range(self, "removal_warmup", least=0, most=1)
+        check_range(self, "threshold", "near", "removal_rate", least=0, most=0.999)
 
 
 @dataclass
@@ -180,9 +167,9 @@ class GoalConfig(FitConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        at_least(1, negatives=self.negatives)
-        at_least(0, context=self.context)
-        within(0, 0.999, near=self.near, removal_rate=self.removal_rate)
+        check_range(self, "negatives", least=1)
+        check_range(self, "context", least=0)
+        check_range(self, "near", "removal_rate", least=0, most=0.999)
 
 
 @dataclass
@@ -207,10 +194,9 @@ class SelfExamineConfig(SelfExaminationConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("reward", self.reward, ("action", "goal"))
-        at_least(1, num_envs=self.num_envs, pairs=self.pairs)
-        at_least(0, imitation_weight=self.imitation_weight, reward_steps=self.reward_steps)
-        if not self.reward_lr > 0:
-            raise UserError(f"reward_lr must be above 0, got {self.reward_lr}")
+        check_range(self, "num_envs", "pairs", least=1)
+        check_range(self, "imitation_weight", "reward_steps", least=0)
+        check_range(self, "reward_lr", above=0)
 
 
 @dataclass
@@ -236,8 +222,8 @@ class EvaluateConfig:
         check_choice("mode", self.mode, ("greedy", "sampled", "both"))
         check_choice("stream", self.stream, STREAMS)
         check_choice("split", self.split, ("all", "train", "zero-shot"))
-        at_least(1, episodes=self.episodes, audit_episodes=self.audit_episodes)
-        at_least(0, states=self.states)
+        check_range(self, "episodes", "audit_episodes", least=1)
+        check_range(self, "states", least=0)
 
 
 @dataclass
@@ -328,8 +314,8 @@ class Options:
     def __post_init__(self) -> None:
         check_choice("logger", self.logger, LOGGERS)
         check_choice("until", self.until, (None, *STAGES))
-        within(1, 1024, threads=self.threads)
-        within(0, 86_400, checkpoint_seconds=self.checkpoint_seconds)
+        check_range(self, "threads", least=1, most=1024)
+        check_range(self, "checkpoint_seconds", least=0, most=86_400)
         if not str(self.run).strip(" /"):
             raise UserError("run needs a name, or the path of a folder")
         if set("/\\\0") & set(self.variant or ""):

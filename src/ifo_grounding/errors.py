@@ -81,6 +81,32 @@ def check_numbers(config: Any, unbounded: Iterable[str] = ()) -> None:
             raise UserError(f"{field.name} must be finite")
 
 
+def check_range(
+    config: Any,
+    *names: str,
+    least: float | None = None,
+    above: float | None = None,
+    most: float | None = None,
+) -> None:
+    """Refuse numbers of a dataclass that are outside of a range; None passes.
+
+    >>> from types import SimpleNamespace
+    >>> check_range(SimpleNamespace(steps=3, lr=0), "steps", "lr", above=0)
+    Traceback (most recent call last):
+    ifo_grounding.errors.UserError: lr must be above 0, got 0
+    """
+    for name in names:
+        value = getattr(config, name)
+        if value is None:
+            continue
+        if least is not None and not value >= least:
+            raise UserError(f"{name} must be at least {least}, got {value}")
+        if above is not None and not value > above:
+            raise UserError(f"{name} must be above {above}, got {value}")
+        if most is not None and not value <= most:
+            raise UserError(f"{name} must be at most {most}, got {value}")
+
+
 def did_you_mean(given: str, allowed: Iterable[str]) -> str:
     """Return a hint at the name that is most like the one given, empty where none is.
 

@@ -1,35 +1,31 @@
 """The supervised loop and the self-examination loop that the recipes share."""
 
-from ifo_grounding.training.adversary import Adversary
+from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
+from ifo_grounding.training.best_checkpoint import BestCheckpoint
 from ifo_grounding.training.checkpoint import Checkpoint
-from ifo_grounding.training.cloning import NothingAcceptedError, accepted, accepted_steps
-from ifo_grounding.training.guard import Guard
-from ifo_grounding.training.held_out import HeldOut
-from ifo_grounding.training.pairs import load_pairs, save_pairs, select_pairs
-from ifo_grounding.training.rehearsal import Rehearsal
+from ifo_grounding.training.early_stopping import EarlyStopping
+from ifo_grounding.training.held_out_accuracy import HeldOutAccuracy
+from ifo_grounding.training.pairs import select_pairs
 from ifo_grounding.training.run import Run, Stage
-from ifo_grounding.training.selection import Selection, SelectionSchedule
 from ifo_grounding.training.self_examination import SelfExaminationConfig, self_examine
 from ifo_grounding.training.supervised import FitConfig, fit
+from ifo_grounding.training.trials import Trial, successive_halving, trial_seed
 
 __all__ = [
-    "Adversary",
+    "AdversarialUpdates",
+    "AuxiliaryImitation",
+    "BestCheckpoint",
     "Checkpoint",
+    "EarlyStopping",
     "FitConfig",
-    "Guard",
-    "HeldOut",
-    "NothingAcceptedError",
-    "Rehearsal",
+    "HeldOutAccuracy",
     "Run",
-    "Selection",
-    "SelectionSchedule",
     "SelfExaminationConfig",
     "Stage",
-    "accepted",
-    "accepted_steps",
+    "Trial",
     "fit",
-    "load_pairs",
-    "save_pairs",
     "select_pairs",
     "self_examine",
+    "successive_halving",
+    "trial_seed",
 ]

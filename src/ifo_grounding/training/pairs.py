@@ -1,32 +1,25 @@
-"""The paper's fixed set of chosen starts: pairs of a scene and a suitable instruction."""
+"""The paper's fixed set of starts: pairs of a scene and a suitable instruction."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ifo_grounding.errors import UserError, at_least_one
-from ifo_grounding.files import atomic_write
 from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
 from ifo_grounding.seeding import generator
 from ifo_grounding.transforms.choosing import PoolScorer, check_pool, choose_instructions
 from ifo_grounding.transforms.sampler import NothingSuitableError
-from ifo_grounding.transforms.starts import FRAME_HASH, check_pairs, frame_hash
+from ifo_grounding.transforms.starts import FRAME_HASH, frame_hash
 
 SCORE = "score"
 """Key of the probability that a stored pair is suitable, float32 [N, 1]."""
-FRUITLESS_RESETS = 100
-"""Resets in a row that may serve no state before the search is given up."""
-JUDGED_STATES, LEAST_SERVED = 20_000, 0.002
-"""States from which on the search is given up where a smaller share than this is served."""
+PATIENCE, LEAST_SERVED = 100, 0.002
+"""Resets from which on the search is given up where a smaller share of states has a pair."""
 
 
 def select_pairs(
@@ -43,7 +36,7 @@ def select_pairs(
 ) -> TensorDict:
     """Store ``n`` scenes of a simulator, each with a suitable instruction (5K or 10K in the paper).
 
-    Only first frames are looked at. :class:`ifo_grounding.transforms.StartingPairs` begins episodes
+    Only first frames are scored. :class:`ifo_grounding.transforms.StartingPairs` begins episodes
     with the pairs, in an environment made with the same arguments.
 
     Args:
@@ -63,8 +56,7 @@ def select_pairs(
 
     Raises:
         UserError: on a simulator that does not number its scenes, or an impossible option.
-        NothingSuitableError: where 100 resets in a row bring no suitable pair, or 20,000 states
-            fewer than 40.
+        NothingSuitableError: where, after 100 resets, less than one state in 500 has a pair.
 
     >>> from tensordict.nn import TensorDictModule
     >>> from ifo_grounding.envs import PickAndPlaceEnv
@@ -85,7 +77,8 @@ def select_pairs(
     scorer = PoolScorer(classifier, check_pool(pool).unique(dim=0))
     source = generator(seed, "select-pairs")
     found: list[TensorDict] = []
-    count, seen, fruitless, best_score = 0, 0, 0, 0.0
+    count = seen = resets = 0
+    best_score = 0.0
     with tqdm(total=n, desc="pairs", disable=not progress) as bar:
         while count < n:
             pixels = env.reset()[PIXELS].flatten(0, -4)
@@ -99,21 +92,14 @@ def select_pairs(
                 generator=source,
             )
             rows = (choices.chosen >= 0).nonzero().squeeze(-1)[: n - count]
-            seen, count = seen + len(pixels), count + len(rows)
-            fruitless = 0 if len(rows) else fruitless + 1
+            seen, count, resets = seen + len(pixels), count + len(rows), resets + 1
             best_score = max(best_score, float(choices.score.max()))
-            if fruitless >= FRUITLESS_RESETS:
+            if resets >= PATIENCE and count < min(n, LEAST_SERVED * seen):
                 raise NothingSuitableError(
-                    f"no instruction of the pool scored above {threshold} on any of the last "
-                    f"{fruitless * len(pixels)} states (best score seen: {best_score:.2f}): lower "
-                    "threshold, raise candidates, or train the classifier longer"
-                )
-            if seen >= JUDGED_STATES and count < min(n, LEAST_SERVED * seen):
-                raise NothingSuitableError(
-                    f"only {count} of {seen:,} states got an instruction that scored "
-                    f"above {threshold} (best score seen: {best_score:.2f}), too few to find "
-                    f"{n:,} pairs: lower threshold, raise candidates, or train the classifier or "
-                    "the policy that it begins with longer"
+                    f"only {count:,} of {seen:,} states got an instruction that scored above "
+                    f"{threshold} (best score seen: {best_score:.2f}), too few to find {n:,} "
+                    "pairs: lower threshold, raise candidates, or train the classifier, or the "
+                    "policy that it was initialised from, longer"
                 )
             found.append(_pairs(env.scene_numbers.flatten(), pixels, choices, scorer.pool, rows))
             bar.update(len(rows))
@@ -135,30 +121,3 @@ def _pairs(
         FRAME_HASH: frame_hash(pixels[rows]).unsqueeze(-1),
     }
     return TensorDict(entries, batch_size=[len(rows)]).cpu()
-
-
-def save_pairs(pairs: TensorDictBase, path: str | Path) -> None:
-    """Write pairs as safetensors, atomically."""
-    tensors = {key: value.contiguous().cpu() for key, value in check_pairs(pairs).items()}
-    with atomic_write(path) as temporary:
-        save_file(tensors, str(temporary))
-
-
-def load_pairs(path: str | Path) -> TensorDict:
-    """Read pairs that :func:`save_pairs` wrote.
-
-    Raises:
-        UserError: where the file is missing, damaged, or holds something else.
-    """
-    try:
-        tensors = load_file(str(path))
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist: make it with select_pairs") from None
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} holds no pairs ({error}): make them with select_pairs") from None
-    lengths = {len(tensor) if tensor.ndim else 0 for tensor in tensors.values()}
-    if len(lengths) != 1:
-        raise UserError(f"{path} holds no pairs: its entries have different lengths")
-    pairs = TensorDict(tensors, batch_size=[lengths.pop()])
-    check_pairs(pairs)
-    return pairs

@@ -1,4 +1,4 @@
-"""Policy gradient on TorchRL's losses: collecting steps, estimating advantages, updating."""
+"""Policy gradient on TorchRL's losses: collects steps, estimates advantages, updates."""
 
 from __future__ import annotations
 
@@ -10,21 +10,23 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
 from torchrl.objectives.value import GAE
 
 from ifo_grounding import keys
 from ifo_grounding.modules import output_key
-from ifo_grounding.training.environment import make_collector
-from ifo_grounding.training.rehearsal import Rehearsal
-from ifo_grounding.training.supervised import Metrics, make_optimizer, update
+from ifo_grounding.training.auxiliary import AuxiliaryImitation
+from ifo_grounding.training.loop import Metrics
+from ifo_grounding.training.updates import make_optimizer, update
 
 if TYPE_CHECKING:
     from ifo_grounding.training.self_examination import SelfExaminationConfig
 
 AT_ONCE = 2048
-"""Steps whose values are estimated at once: as fast as all of them, in a fraction of the memory."""
+"""Steps whose values are estimated together: as fast as all at once, in a fraction of the memory.
+"""
 
 
 class Learner:
@@ -36,15 +38,19 @@ class Learner:
         policy: ProbabilisticTensorDictSequential,
         value: TensorDictModuleBase,
         config: SelfExaminationConfig,
-        rehearsal: Rehearsal | None = None,
+        imitation: AuxiliaryImitation | None = None,
     ) -> None:
-        self.config, self.policy, self.rehearsal = config, policy, rehearsal
-        self.value = value
-        self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl else None
-        self.collector = make_collector(env, policy, config.steps)
+        self.config, self.policy, self.value, self.imitation = config, policy, value, imitation
+        self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl_penalty else None
+        self.collector = _make_collector(env, policy, config.steps)
         self.batches: Iterator[TensorDictBase] | None = None
-        # Values are given: the estimator would look at nearly all states twice, as next ones too.
-        self.advantage = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=None)
+        self.advantage = GAE(
+            gamma=config.gamma,
+            lmbda=config.lmbda,
+            value_network=value,
+            deactivate_vmap=True,  # networks compute what repeats once, in shapes that vmap lacks
+            value_chunk_size=max(1, AT_ONCE // config.steps),
+        )
         self.loss = _make_loss(policy, value, config)
         worth = output_key(value, keys.STATE_VALUE)
         for part in (self.advantage, self.loss):
@@ -57,14 +63,14 @@ class Learner:
         self.optimizer.add_param_group({"params": list(value.parameters()), "lr": config.value_lr})
 
     def collect(self) -> TensorDictBase:
-        """Roll out the policy from a reset, [N, T], without whatever the simulator judged."""
+        """Roll out the policy from a reset, [N, T], without the simulator's own reward."""
         if self.batches is None:
             self.batches = iter(self.collector)
         return next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
 
     @torch.no_grad()
-    def charge(self, batch: TensorDictBase) -> Metrics:
-        """Let collected steps pay for being away from the phase-1 policy, where that costs."""
+    def penalise_divergence(self, batch: TensorDictBase) -> Metrics:
+        """Take ``kl_penalty`` times log(policy / phase-1 policy) of each action off its reward."""
         if self.reference is None:
             return {}
         steps = batch.reshape(-1)
@@ -73,13 +79,14 @@ class Learner:
         current = torch.cat([_log_prob(self.policy, part) for part in parts])
         away = (current - reference).reshape(*batch.shape, 1)
         reward = batch[keys.NEXT, keys.LEARNED_REWARD]
-        batch[keys.NEXT, keys.LEARNED_REWARD] = reward - self.config.kl * away
+        batch[keys.NEXT, keys.LEARNED_REWARD] = reward - self.config.kl_penalty * away
         return {"divergence": float(away.mean())}
 
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""
         config = self.config
-        self._estimate_advantages(batch)
+        with torch.no_grad():
+            self.advantage(batch)
         scale = 1 - iteration / config.iterations if config.anneal else 1.0
         trained = iteration >= config.value_warmup
         self.optimizer.param_groups[0]["lr"] = scale * config.lr if trained else 0.0
@@ -92,43 +99,33 @@ class Learner:
         for _ in range(epochs):
             for rows in torch.randperm(len(steps)).split(config.minibatch):
                 losses = self.loss(steps[rows])
-                if self.rehearsal:
-                    losses["loss_rehearsal"] = self.rehearsal()
+                if self.imitation:
+                    losses["loss_imitation"] = self.imitation()
                 for key, scalar in update(losses, self.optimizer, config.grad_clip).items():
                     sums[key] = sums.get(key, torch.zeros(())) + scalar.cpu()
                 updates += 1
         return {key: float(total) / updates for key, total in sums.items()}
 
-    @torch.no_grad()
-    def _estimate_advantages(self, batch: TensorDictBase) -> None:
-        """Write advantages and value targets of steps [*B, T]."""
-        names, seen = self.advantage.tensor_keys, self.value.in_keys
-        value = self._values(batch.select(*seen).reshape(-1)).view(*batch.shape, 1)
-        if not self.config.gamma:  # what comes next would count nothing
-            reward = batch[keys.NEXT, keys.LEARNED_REWARD]
-            found = {names.advantage: reward - value, names.value_target: reward}
-            batch.update({**found, names.value: value})
-            return
-        # The next state is the next step's own, but where an episode or the batch is cut off; where
-        # one ends, it counts nothing.
-        upcoming = batch[keys.NEXT]
-        cut = upcoming["done"].clone()
-        cut[..., -1, :] = True
-        cut &= ~upcoming["terminated"]
-        following = value.roll(-1, -2)
-        if cut.any():
-            following[cut] = self._values(upcoming.select(*seen)[cut.squeeze(-1)]).view(-1)
-        batch[names.value], batch[keys.NEXT, names.value] = value, following
-        self.advantage(batch)
-
-    def _values(self, states: TensorDictBase) -> Tensor:
-        """Return the values of states [M], some at a time."""
-        name = self.advantage.tensor_keys.value
-        return torch.cat([self.value(part)[name] for part in states.split(AT_ONCE)])
-
     def close(self) -> None:
         """Let go of the collector, and leave the env open for its owner."""
         self.collector.shutdown(close_env=False)
+
+
+def _make_collector(env: EnvBase, policy: TensorDictModuleBase, steps: int) -> Collector:
+    """Return a collector of ``steps`` steps of each world per round, each from a reset.
+
+    On a CPU a round is written over the one before: keep copies of what has to last.
+    """
+    return Collector(
+        env,
+        policy,
+        frames_per_batch=env.batch_size.numel() * steps,
+        total_frames=-1,
+        reset_at_each_iter=True,
+        trust_policy=True,
+        auto_register_policy_transforms=False,
+        return_same_td=env.device is not None and env.device.type == "cpu",
+    )
 
 
 def _make_loss(

@@ -19,7 +19,7 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import atomic_write, home, read_json, write_json
 from ifo_grounding.machine import processor
 from ifo_grounding.training.checkpoint import difference, spent
-from ifo_grounding.training.supervised import Log, Metrics
+from ifo_grounding.training.loop import Log, Metrics
 
 EXTRAS = ("tensorboard", "wandb")
 """Loggers that are packages of their own, and extras of this one."""
@@ -114,14 +114,12 @@ class Run:
 
         try:
             options = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+            if isinstance(options, dict):
+                return {str(name): value for name, value in options.items()}
+            why = "it holds no options"
         except (OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
-            raise self._damaged(str(error).splitlines()[0]) from None
-        if not isinstance(options, dict):
-            raise self._damaged("it holds no options")
-        return {str(name): value for name, value in options.items()}
-
-    def _damaged(self, why: str) -> UserError:
-        return UserError(f"{self / OPTIONS} is damaged ({why}): restore it, or give another run=")
+            why = str(error).splitlines()[0]
+        raise UserError(f"{path} is damaged ({why}): restore it, or give another run=")
 
     def begin(self, options: dict[str, Any], free: Collection[str] = ()) -> dict[str, Any]:
         """Write the options of a new run, or make sure that a run goes on with those it has.

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from ifo_grounding import keys
 from ifo_grounding.allocation import release_freed_memory
-from ifo_grounding.errors import UserError, at_least_one, check_choice, check_numbers
+from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.seeding import derive
-from ifo_grounding.training.adversary import Adversary
+from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
+from ifo_grounding.training.best_checkpoint import BestCheckpoint
 from ifo_grounding.training.checkpoint import Checkpoint
-from ifo_grounding.training.environment import (
-    check_env,
+from ifo_grounding.training.held_out_accuracy import HeldOutAccuracy
+from ifo_grounding.training.loop import Log, Loop, Metrics
+from ifo_grounding.training.policy_gradient import Learner
+from ifo_grounding.training.reseeding import (
     fixes_scenes,
     reseed,
     sampler_stats,
-    summary,
     transforms_of,
     workers_fix_scenes,
 )
-from ifo_grounding.training.guard import Guard
-from ifo_grounding.training.policy_gradient import Learner
-from ifo_grounding.training.rehearsal import Rehearsal
-from ifo_grounding.training.selection import Selection, SelectionSchedule
-from ifo_grounding.training.supervised import Callback, Log, Metrics, plain_numbers
+from ifo_grounding.transforms._common import exposes_state, innermost, instructs
 
 ALGORITHMS = ("ppo", "reinforce")
 NAME = "self-examination"
@@ -61,60 +62,41 @@ class SelfExaminationConfig:
     """Clipping range of the probability ratio."""
     entropy: float = 0.01
     """Weight of the entropy bonus, with ``ppo``."""
-    kl: float = 0.0
-    """Reward that each nat away from the phase-1 policy costs."""
+    kl_penalty: float = 0.0
+    """Reward that each nat of divergence from the phase-1 policy costs."""
     value_warmup: int = 2
     """First iterations, of more, that train the value head alone."""
     grad_clip: float = 1.0
     """Largest norm of the gradient."""
     select_every: int = 0
-    """Iterations between two looks at the greedy policy's learned return or, beside an adversary,
-    its agreement with the guard's demonstrations. In the end the best policy is kept, which may be
-    phase 1's; 0 keeps the last one."""
+    """Iterations between two measures of the greedy policy: its learned return or, with adversarial
+    updates, its accuracy on held-out demonstrations. In the end the best policy is kept, which may
+    be phase 1's; 0 keeps the last one."""
     select_margin: float = 2.0
     """Standard errors by which a policy has to be better than the best one to be kept: 2 keeps
-    clear gains alone, -1 keeps all practice that does no clear harm."""
+    clear gains alone, -1 whatever is not clearly worse."""
     select_episodes: int = 512
-    """Episodes of each look, always from the same starts."""
+    """Episodes of each such measure, always from the same starts."""
     max_steps: int = 40
-    """Most actions of an episode of such a look."""
+    """Most actions of each of these episodes."""
     evaluate_every: int = 0
     """Iterations between two calls of the callback; 0 calls it at the end only."""
-    checkpoint_every: int = 1
-    """Iterations between two checkpoints."""
 
     def __post_init__(self) -> None:
-        """Refuse unknown algorithms and empty budgets."""
+        """Refuse unknown algorithms and values out of range."""
         check_numbers(self, unbounded=["grad_clip", "select_margin"])
         check_choice("algorithm", self.algorithm, ALGORITHMS)
-        counts = ("iterations", "steps", "epochs", "minibatch", "select_episodes", "max_steps")
-        for name in (*counts, "checkpoint_every"):
-            at_least_one(name, getattr(self, name))
-        for name in ("lr", "value_lr", "clip", "grad_clip"):
-            if getattr(self, name) <= 0:
-                raise UserError(f"{name} must be above 0, got {getattr(self, name)}")
-        for name in ("gamma", "lmbda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UserError(f"{name} must be within 0..1, got {getattr(self, name)}")
-        for name in ("entropy", "kl", "value_warmup", "select_every", "evaluate_every"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name} must not be negative, got {getattr(self, name)}")
+        check_range(self, "iterations", "steps", "epochs", "minibatch", least=1)
+        check_range(self, "select_episodes", "max_steps", least=1)
+        check_range(self, "lr", "value_lr", "clip", "grad_clip", above=0)
+        check_range(self, "gamma", "lmbda", least=0, most=1)
+        check_range(self, "entropy", "kl_penalty", "value_warmup", least=0)
+        check_range(self, "select_every", "evaluate_every", least=0)
         if self.value_warmup >= self.iterations:
             raise UserError(
                 f"value_warmup={self.value_warmup} of {self.iterations} iterations: the policy "
                 "would never learn; lower it, or raise iterations"
             )
-
-    @property
-    def selection(self) -> SelectionSchedule:
-        """When and how the best policy is chosen."""
-        return SelectionSchedule(
-            self.select_every,
-            self.iterations,
-            self.select_episodes,
-            self.max_steps,
-            self.select_margin,
-        )
 
 
 def self_examine(
@@ -124,12 +106,13 @@ def self_examine(
     config: SelfExaminationConfig,
     *,
     seed: int,
-    adversary: Adversary | None = None,
-    rehearsal: Rehearsal | None = None,
-    guard: Guard | None = None,
+    adversarial: AdversarialUpdates | None = None,
+    imitation: AuxiliaryImitation | None = None,
+    held_out: HeldOutAccuracy | None = None,
     checkpoint: str | Path | None = None,
+    checkpoint_seconds: float = 15.0,
     log: Log | None = None,
-    callback: Callback | None = None,
+    callback: Callable[[int], Metrics] | None = None,
     progress: bool = False,
 ) -> list[Metrics]:
     """Improve ``policy`` in place by policy gradient on learned rewards.
@@ -143,11 +126,12 @@ def self_examine(
         config: algorithm and budget.
         seed: all randomness is a function of it and of the iteration, and every iteration starts
             from a reset: a run continues from its checkpoint to the same result.
-        adversary: trains the reward model on, with the steps of each iteration.
-        rehearsal: imitates the demonstrations on.
-        guard: keeps policies from being selected that go astray of its demonstrations. With an
-            adversary the best policy is the one that agrees most with them.
+        adversarial: trains the reward model on, with the steps of each iteration.
+        imitation: imitates the demonstrations on.
+        held_out: keeps policies from being selected that are clearly less accurate on held-out
+            demonstrations than phase 1. With ``adversarial`` the most accurate policy is the best.
         checkpoint: file to continue from and to save to.
+        checkpoint_seconds: least time between two checkpoints.
         log: gets the metrics of each iteration.
         callback: gets the iteration, returns further metrics; the place for audits.
         progress: whether to show a progress bar.
@@ -157,81 +141,119 @@ def self_examine(
 
     Raises:
         UserError: where the env exposes its true state, or has no learned reward, or where the best
-            policy is to be selected beside an adversary, without a guard, or with starts inside of
-            workers.
+            policy is to be selected with ``adversarial`` but without ``held_out``, or with starts
+            inside of workers.
     """
-    check_env(env)
+    _check(env, config, adversarial, held_out)
+    policy.eval()
+    value.eval()
+    # Before a collector resets the env, so that it remembers the first starts.
+    best = BestCheckpoint(
+        env,
+        policy,
+        seed=seed,
+        episodes=config.select_episodes,
+        max_steps=config.max_steps,
+        margin=config.select_margin,
+        held_out=held_out,
+        by_accuracy=adversarial is not None and config.select_every > 0,
+    )
+    learner = Learner(env, policy, value, config, imitation)
+    sampler_stats(env)  # forgets the reset that a collector begins with
+    parts = _parts(env, learner, best, adversarial)
+    settings = {**asdict(config), "seed": seed, "worlds": env.batch_size.numel()}
+    saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
+    loop = Loop(NAME, config.iterations, saved, checkpoint_seconds, log, progress)
+    every = config.select_every
+    if every and not loop.history:
+        best.consider()
+    for iteration in loop:
+        reseed(env, derive(seed, NAME, iteration))
+        batch = learner.collect()
+        metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
+        metrics |= sampler_stats(env)
+        metrics |= learner.penalise_divergence(batch)
+        metrics |= learner.improve(batch, iteration)
+        release_freed_memory()  # batches of distinct pictures differ in size and would pile up
+        if adversarial:
+            metrics |= adversarial(batch)
+        done, last = iteration + 1, iteration + 1 == config.iterations
+        if every and (last or done % every == 0):
+            metrics |= best.consider()
+        if last:
+            best.restore()
+        if callback and (last or (config.evaluate_every and done % config.evaluate_every == 0)):
+            metrics |= {name: float(number) for name, number in callback(done).items()}
+        loop.add(metrics, done)
+    learner.close()
+    return loop.history
+
+
+def _check(
+    env: EnvBase,
+    config: SelfExaminationConfig,
+    adversarial: AdversarialUpdates | None,
+    held_out: HeldOutAccuracy | None,
+) -> None:
+    """Refuse an env that leaks or lacks something, and a selection that is impossible."""
+    simulator = innermost(env)
+    if exposes_state(simulator):
+        raise UserError("self-examination never sees the true state: use expose_state=False")
+    if instructs(simulator):
+        raise UserError("self-examination never sees true instructions: use instructed=False")
+    observed = env.observation_spec.keys(True, True)
+    if keys.INSTRUCTION not in observed:
+        raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
+    written = [*env.full_reward_spec.keys(True, True), *observed]
+    if keys.LEARNED_REWARD not in written:
+        raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
     if config.select_every and workers_fix_scenes(env):
         raise UserError(
             "policies are compared on the same starts, and those inside of workers cannot be gone "
             "back to: set select_every=0 to keep the last one, or do without workers"
         )
-    by_agreement = adversary is not None and config.select_every > 0
-    if by_agreement and guard is None:
+    if config.select_every and adversarial is not None and held_out is None:
         raise UserError(
-            "an adversary trains the judge on, whose returns cannot then be compared from one look "
-            "to the next: give a guard, by whose demonstrations the best policy is selected, or "
-            "set select_every=0 to keep the last"
+            "adversarial updates change the reward model, whose returns cannot then be compared "
+            "from one iteration to the next: give held_out=, by whose accuracy the best policy is "
+            "selected, or set select_every=0 to keep the last"
         )
-    policy.eval()
-    value.eval()
-    # Before a collector resets the env, so that it remembers the first starts.
-    selection = Selection(env, policy, config.selection, seed, guard, by_agreement)
-    learner = Learner(env, policy, value, config, rehearsal)
-    sampler_stats(env)  # forgets the reset that a collector begins with
-    parts: dict[str, Any] = {
-        "loss": learner.loss,
-        "optimizer": learner.optimizer,
-        "best": selection,
-    }
+
+
+def _parts(
+    env: EnvBase,
+    learner: Learner,
+    best: BestCheckpoint,
+    adversarial: AdversarialUpdates | None,
+) -> dict[str, Any]:
+    """Return what a checkpoint has to keep."""
+    parts: dict[str, Any] = {"policy": learner.policy, "value": learner.value}
+    parts |= {"optimizer": learner.optimizer, "best": best}
     if learner.reference is not None:
         parts["reference"] = learner.reference
-    if adversary:
-        parts["adversary"] = adversary
-    parts |= {
-        f"starts {place}": transform
-        for place, transform in enumerate(transforms_of(env))
-        if fixes_scenes(transform)
-    }
-    settings = {**asdict(config), "seed": seed, "worlds": env.batch_size.numel()}
-    saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
-    state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
-    history: list[Metrics] = state["history"]
-    if not state["iteration"]:
-        selection.after(0)
-    from tqdm import tqdm
+    if adversarial is not None:
+        parts |= {"reward": adversarial.loss, "reward optimizer": adversarial.optimizer}
+    starts = [transform for transform in transforms_of(env) if fixes_scenes(transform)]
+    return parts | {f"starts {number}": transform for number, transform in enumerate(starts)}
 
-    bar = tqdm(
-        total=config.iterations,
-        initial=state["iteration"],
-        desc=NAME,
-        disable=not progress,
-        leave=False,
-    )
-    with bar:
-        for iteration in range(state["iteration"], config.iterations):
-            reseed(env, derive(seed, NAME, iteration))
-            batch = learner.collect()
-            metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
-            metrics |= sampler_stats(env)
-            metrics |= learner.charge(batch)
-            metrics |= learner.improve(batch, iteration)
-            release_freed_memory()  # batches of distinct pictures differ in size and would pile up
-            if adversary:
-                metrics |= adversary(batch)
-            done = iteration + 1
-            metrics |= selection.after(done)
-            if done == config.iterations:
-                selection.restore()
-            due = config.evaluate_every and done % config.evaluate_every == 0
-            if callback and (due or done == config.iterations):
-                metrics |= plain_numbers(callback(done))
-            history.append(metrics)
-            if log:
-                log(metrics, done)
-            if saved and (done % config.checkpoint_every == 0 or done == config.iterations):
-                saved.save({"iteration": done, "history": history})
-            bar.set_postfix(reward=f"{metrics['learned_return']:.3f}", refresh=False)
-            bar.update()
-    learner.close()
-    return history
+
+def summary(batch: TensorDictBase) -> Metrics:
+    """Describe collected steps [N, T], which begin with a reset, by what the learner can see.
+
+    Returns and lengths are those of finished episodes: the last one of a row is mostly cut, and so
+    are all that take longer than T steps.
+    """
+    done = batch[keys.NEXT, "done"].reshape(batch.shape)
+    stopped = batch[keys.NEXT, "terminated"].reshape(batch.shape)
+    reward = batch[keys.NEXT, keys.LEARNED_REWARD].reshape(batch.shape)
+    finished = done.flip(-1).cumsum(-1).flip(-1) > 0
+    episodes = done.sum().clamp(min=1)
+    cut = (~done[..., -1]).sum()
+    return {
+        "frames": float(batch.numel()),
+        "learned_reward": float(reward.mean()),
+        "learned_return": float((reward * finished).sum() / episodes),
+        "episode_length": float(finished.sum() / episodes),
+        "stopped": float(stopped.sum() / episodes),
+        "unfinished": float(cut / (done.sum() + cut)),
+    }

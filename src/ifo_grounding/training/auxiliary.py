@@ -1,0 +1,88 @@
+"""What self-examination may learn from demonstrations beside its policy gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+
+from ifo_grounding.errors import check_range
+from ifo_grounding.modules import beside
+from ifo_grounding.objectives import ImitationLoss, RewardLoss
+from ifo_grounding.training.loop import Metrics
+from ifo_grounding.training.updates import make_optimizer, update
+
+
+@dataclass
+class AuxiliaryImitation:
+    """Adds the imitation loss to every gradient step of the policy.
+
+    Self-examination covers the instructions that the instruction classifier is sure of;
+    demonstrations cover the others too. Without them the policy forgets what it does not explore
+    (Rajeswaran et al. 2018, who mix demonstrations into policy gradients). An extension of the
+    paper.
+    """
+
+    loss: ImitationLoss
+    """Imitation loss of the policy that is improved."""
+    buffer: ReplayBuffer
+    """Labelled demonstrations."""
+    weight: float
+    """Weight of the imitation loss, above 0."""
+    batch_size: int = 256
+    """Labelled steps per gradient step."""
+
+    def __post_init__(self) -> None:
+        """Refuse weights and batches that cannot be."""
+        check_range(self, "weight", above=0)
+        check_range(self, "batch_size", least=1)
+
+    def __call__(self) -> Tensor:
+        """Return the weighted loss of a batch of demonstrations, a scalar."""
+        batch = beside(self.buffer.sample(self.batch_size), self.loss)
+        return self.weight * self.loss(batch)["loss_imitation"]
+
+
+class AdversarialUpdates:
+    """Trains the reward model on while the policy improves (paper, "Reward Module").
+
+    Demonstrated actions are positives, the policy's own actions are negatives.
+
+    Args:
+        loss: the reward model's loss.
+        demonstrations: labelled demonstrations.
+        steps: gradient steps after each iteration of self-examination.
+        lr: learning rate.
+        batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
+        smoothing: how far the targets are from 1 and 0, for the policy is often right.
+        grad_clip: largest norm of the gradient.
+    """
+
+    def __init__(
+        self,
+        loss: RewardLoss,
+        demonstrations: ReplayBuffer,
+        steps: int,
+        lr: float,
+        batch_size: int = 256,
+        smoothing: float = 0.1,
+        grad_clip: float = 1.0,
+    ) -> None:
+        self.loss, self.demonstrations, self.steps = loss, demonstrations, steps
+        self.batch_size, self.smoothing, self.grad_clip = batch_size, smoothing, grad_clip
+        self.optimizer = make_optimizer(loss.parameters(), lr)
+
+    def __call__(self, batch: TensorDictBase) -> Metrics:
+        """Train on the policy's steps [N, T] and return mean metrics, named ``reward/...``."""
+        policy_steps = batch.reshape(-1)
+        totals: dict[str, float] = {}
+        for _ in range(self.steps):
+            rows = torch.randint(len(policy_steps), (self.batch_size,))
+            shown = beside(self.demonstrations.sample(self.batch_size), self.loss)
+            losses = self.loss.adversarial(shown, policy_steps[rows], self.smoothing)
+            for key, value in update(losses, self.optimizer, self.grad_clip).items():
+                totals[key] = totals.get(key, 0.0) + float(value) / self.steps
+        return {f"reward/{key}": value for key, value in totals.items()}

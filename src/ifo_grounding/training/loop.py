@@ -1,0 +1,82 @@
+"""What both training loops do from one iteration to the next."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+
+from tqdm import tqdm
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.training.checkpoint import Checkpoint
+
+Metrics = dict[str, float]
+Log = Callable[[Metrics, int], None]
+
+
+class Loop:
+    """Iterations of a training loop, which go on from a checkpoint and end in one.
+
+    Args:
+        name: of the progress bar, and in errors.
+        iterations: how many there are, or after how many to pause.
+        saved: checkpoint to go on from and to save to, if any.
+        seconds: least time between two checkpoints.
+        log: gets the metrics of each iteration and the step.
+        progress: whether to show a progress bar.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        iterations: int,
+        saved: Checkpoint | None,
+        seconds: float,
+        log: Log | None,
+        progress: bool,
+    ) -> None:
+        self.name, self.iterations, self.saved, self.seconds = name, iterations, saved, seconds
+        self.log, self.progress = log, progress
+        state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
+        self.done: int = state["iteration"]
+        self.history: list[Metrics] = state["history"]
+        self._last_save = time.monotonic()
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield the iterations that are still to be done, and show how far they are."""
+        off = not self.progress
+        first, end = self.done, self.iterations
+        with tqdm(total=end, initial=first, desc=self.name, disable=off, leave=False) as bar:
+            for iteration in range(first, end):
+                yield iteration
+                bar.set_postfix(_brief(self.history[-1]), refresh=False)
+                bar.update()
+
+    def add(self, metrics: Metrics, step: int) -> None:
+        """Note the metrics of an iteration, and save if it is time to.
+
+        Raises:
+            UserError: where a loss is no longer finite.
+        """
+        losses = [key for key in metrics if key.startswith("loss_")]
+        if lost := [key for key in losses if not math.isfinite(metrics[key])]:
+            raise UserError(
+                f"{self.name} diverged: {', '.join(lost)} no longer finite by step {step}; learn "
+                "with a lower lr"
+            )
+        self.done += 1
+        self.history.append(metrics)
+        if self.log:
+            self.log(metrics, step)
+        due = time.monotonic() - self._last_save > self.seconds or self.done >= self.iterations
+        if self.saved and due:
+            self.saved.save({"iteration": self.done, "history": self.history})
+            self._last_save = time.monotonic()
+
+
+def _brief(metrics: Metrics) -> dict[str, str]:
+    """Return the metrics that a progress bar shows."""
+    told = ("loss", "accuracy", "success", "learned_return")
+    shown = [key for key in metrics if key.startswith(told)]
+    return {key.removeprefix("loss_"): f"{metrics[key]:.3f}" for key in shown[:3]}
