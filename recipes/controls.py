@@ -28,8 +28,6 @@ def continue_imitation(options: Options) -> dict:
         reward = learned_reward(run, options)
         transforms = Compose(chosen_starts(run, options), reward)
         env = TransformedEnv(simulator_of(options, section.num_envs), transforms)
-        held_out = held_out_accuracy(policy, aside, run, options)
-        by_accuracy = adversarial_updates(reward, run, options) is not None
         best = BestCheckpoint(
             env,
             policy,

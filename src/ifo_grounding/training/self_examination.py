@@ -28,7 +28,7 @@ from ifo_grounding.training.reseeding import (
     transforms_of,
     workers_fix_scenes,
 )
-from ifo_grounding.transforms._common import exposes_state, innermost, instructs
+from ifo_grounding.transforms._common import exposes_state, instructs
 
 ALGORITHMS = ("ppo", "reinforce")
 NAME = "self-examination"
@@ -196,17 +196,16 @@ def _check(
     held_out: HeldOutAccuracy | None,
 ) -> None:
     """Refuse an env that leaks or lacks something, and a selection that is impossible."""
-    simulator = innermost(env)
-    if exposes_state(simulator):
+    if exposes_state(env):
         raise UserError("self-examination never sees the true state: use expose_state=False")
-    if instructs(simulator):
+    if instructs(env):
         raise UserError("self-examination never sees true instructions: use instructed=False")
     observed = env.observation_spec.keys(True, True)
     if keys.INSTRUCTION not in observed:
         raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
     written = [*env.full_reward_spec.keys(True, True), *observed]
     if keys.LEARNED_REWARD not in written:
-        raise UserError("the env pays no learned reward: add LearnedReward to its transforms")
+        raise UserError("the env pays no learned reward: add LearnedReward or GoalReward")
     if config.select_every and workers_fix_scenes(env):
         raise UserError(
             "policies are compared on the same starts, and those inside of workers cannot be gone "
