@@ -16,7 +16,7 @@ from torchrl import torchrl_logger
 
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
-from ifo_grounding.data import Demonstrations, LabelReport, recombined
+from ifo_grounding.data import Demonstrations, LabelReport
 from ifo_grounding.data.listing import LIST, read_list
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
@@ -270,8 +270,7 @@ def load_demonstrations(run: Run) -> Demonstrations:
 
 def practised_pool(run: Run, options: DictConfig) -> torch.Tensor:
     """Return the instructions that may be chosen: those of the demonstrations, or more."""
-    pool = load_demonstrations(run).pool()
-    return torch.cat([pool, recombined(pool)]) if options.self_examine.recombine else pool
+    return load_demonstrations(run).pool()
 
 
 def load_labels(run: Run) -> LabelReport:
