@@ -8,7 +8,6 @@ import json
 import math
 import os
 import shutil
-import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -27,12 +26,15 @@ def home() -> Path:
     return Path(os.environ.get("IFO_GROUNDING_HOME", "~/.cache/ifo-grounding")).expanduser()
 
 
-def scratch_file() -> Path:
-    """Make an empty file in :func:`home`, for more than fits into memory; its maker removes it."""
-    home().mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix="scratch-", dir=home())
-    os.close(handle)
-    return Path(name)
+def regular_file(path: Path) -> Path:
+    """Return a path that is read next, which must be a regular file: no folder, no pipe.
+
+    Raises:
+        OSError: where it is another thing, or not there.
+    """
+    if not path.is_file():
+        raise OSError(f"{path} is no regular file")
+    return path
 
 
 @contextlib.contextmanager

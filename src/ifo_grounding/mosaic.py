@@ -7,6 +7,7 @@ tiles and permuting them afterwards.
 from __future__ import annotations
 
 import functools
+import math
 
 import torch
 from torch import Tensor
@@ -14,6 +15,8 @@ from torch import Tensor
 from ifo_grounding.errors import UserError
 
 PIXELS_PER_WORD = 8
+CHUNK_BYTES = 4 << 20
+"""Pixels that are laid at a time on a CPU: they fit its cache."""
 
 
 def as_words(pixels: Tensor) -> Tensor:
@@ -59,15 +62,27 @@ def assemble(table: Tensor, index: Tensor) -> Tensor:
     """
     channels, size, width = table.shape[1:]
     *batch, rows, columns = index.shape
+    shape = (channels, rows * size, columns * width * PIXELS_PER_WORD)
     planes = table.permute(1, 2, 0, 3)  # a plane of all tiles for each row of pixels
     planes = planes.reshape(1, channels, 1, size, -1)
-    places = index.reshape(-1, 1, rows, 1, columns).long()
+    pictures = index.reshape(-1, rows, columns)
+    chunk = max(1, CHUNK_BYTES // max(1, math.prod(shape)))
+    if index.device.type != "cpu" or len(pictures) <= chunk:
+        return _laid(planes, pictures, width).view(*batch, *shape)
+    pixels = torch.empty(len(pictures), *shape, dtype=torch.uint8)
+    for into, some in zip(pixels.split(chunk), pictures.split(chunk), strict=True):
+        into.copy_(_laid(planes, some, width).view_as(into))
+    return pixels.view(*batch, *shape)
+
+
+def _laid(planes: Tensor, index: Tensor, width: int) -> Tensor:
+    """Gather the words of pictures [N, rows, columns], uint8 [N, C, rows, T, columns * T]."""
+    places = index.long()[:, None, :, None]
     if width > 1:
-        word = torch.arange(width, device=table.device)
+        word = torch.arange(width, device=planes.device)
         places = (places.unsqueeze(-1) * width + word).flatten(-2)
-    shape = (len(places), channels, rows, size, columns * width)
-    words = planes.expand(*shape[:4], -1).gather(4, places.expand(shape))
-    return words.view(torch.uint8).reshape(*batch, channels, rows * size, columns * size)
+    shape = (len(places), planes.shape[1], index.shape[1], planes.shape[3], places.shape[-1])
+    return planes.expand(*shape[:4], -1).gather(4, places.expand(shape)).view(torch.uint8)
 
 
 def lay(pixels: Tensor, table: Tensor, places: Tensor, tiles: Tensor) -> None:

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ifo_grounding.data import FrameCodec, _tile_index
-from ifo_grounding.data.codec import smallest_dtype
+from ifo_grounding import mosaic
+from ifo_grounding.data import FrameCodec
 from ifo_grounding.errors import UserError
 from ifo_grounding.world import random_layout, render
 from ifo_grounding.world.tiles import tile_index, tile_table
@@ -29,7 +29,7 @@ def any_frames(draw) -> torch.Tensor:
     return (pixels[..., :height, :width] * 127).to(torch.uint8)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(any_frames())
 def test_any_frames_come_back(frames):
     codec = FrameCodec.fit(frames)
@@ -40,14 +40,14 @@ def test_any_frames_come_back(frames):
     assert torch.equal(decoded, frames)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(any_frames(), st.integers(1, 4))
 def test_pieces_give_the_same_as_the_whole(frames, size):
     codec, codes = FrameCodec.compress(iter(frames.split(size)))
     assert torch.equal(codec.decode(codes), frames)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(any_frames(), any_frames())
 def test_earlier_codes_stay_valid_when_frames_are_added(first, second):
     codec = FrameCodec.fit(first)
@@ -62,7 +62,7 @@ def test_earlier_codes_stay_valid_when_frames_are_added(first, second):
 
 @pytest.mark.parametrize("tile_size", [8, 16, 32])
 def test_frames_of_the_world_shrink_a_hundredfold(tile_size):
-    frames = render(random_layout(400), tile_size)
+    frames = render(random_layout(300), tile_size)
     codec, codes = FrameCodec.compress(frames)
     assert codec.tile_size is not None
     assert codec.tiles.unique(dim=0).shape == codec.tiles.shape
@@ -100,25 +100,13 @@ def test_a_long_stream_of_noise_is_given_up_on_the_way():
     assert torch.equal(codes, torch.cat(list(noise())))
 
 
-def test_a_large_frame_is_decoded_in_pieces_like_a_small_one():
-    frames = render(random_layout(700), 8)
+def test_pictures_are_laid_in_pieces_like_alone(monkeypatch):
+    frames = render(random_layout(20))
     codec, codes = FrameCodec.compress(frames, tile_size=8)
-    alone = torch.stack([codec.decode(code) for code in codes])
-    assert torch.equal(codec.decode(codes), alone)
-
-
-@pytest.mark.parametrize(
-    ("count", "dtype"),
-    [
-        (0, torch.uint8),
-        (256, torch.uint8),
-        (257, torch.int16),
-        (32768, torch.int16),
-        (32769, torch.int32),
-    ],
-)
-def test_codes_are_as_small_as_fits(count, dtype):
-    assert smallest_dtype(count) == dtype
+    monkeypatch.setattr(mosaic, "CHUNK_BYTES", 3 * frames[0].numel())
+    assert torch.equal(codec.decode(codes), frames)
+    with pytest.raises(UserError, match="not in the dictionary"):
+        codec.encode(255 - frames)
 
 
 def test_codes_grow_with_the_dictionary():
@@ -133,26 +121,6 @@ def test_codes_grow_with_the_dictionary():
     assert codes.dtype == torch.int16
     assert len(codec.tiles) == 600
     assert torch.equal(codec.decode(codes), torch.cat(parts))
-
-
-def test_tiles_with_equal_hashes_are_told_apart(monkeypatch):
-    strong = _tile_index.hash_rows
-
-    def weak(words, salt):
-        return strong(words, salt) % 8 if salt < 3 else strong(words, salt)
-
-    monkeypatch.setattr(_tile_index, "hash_rows", weak)
-    frames = render(random_layout(200))
-    codec, codes = FrameCodec.compress(frames, tile_size=8)
-    assert torch.equal(codec.decode(codes), frames)
-    with pytest.raises(UserError, match="not in the dictionary"):
-        codec.encode(255 - frames)
-
-
-def test_top_bits_alone_tell_tiles_apart():
-    rows = torch.zeros(4, 2, dtype=torch.int64)
-    rows[1, 0] = rows[2, 1] = rows[3, 0] = rows[3, 1] = -(2**63)
-    assert len(_tile_index.hash_rows(rows, 0).unique()) == 4
 
 
 def test_codes_of_a_renderer_say_nothing_that_pixels_do_not():
@@ -175,31 +143,11 @@ def test_codes_of_a_renderer_say_nothing_that_pixels_do_not():
     assert abs(pairs.double().corrcoef()[0, 1]) < 0.3
 
 
-def test_equal_pictures_of_a_renderer_become_one():
-    tiles = torch.zeros(3, 3, 8, 8, dtype=torch.uint8)
-    tiles[2] = 9
-    codec, codes = FrameCodec.from_tiles(tiles, [torch.tensor([[[0, 1, 2]]])])
-    assert len(codec.tiles) == 2
-    assert codes[0, 0, 0] == codes[0, 0, 1] != codes[0, 0, 2]
-    assert codec.image_shape == (3, 8, 24)
-
-
-@pytest.mark.parametrize(
-    ("frames", "message"),
-    [
-        (torch.zeros(2, 3, 8, 8), "must be a uint8 tensor .F, C, H, W., got torch.float32"),
-        (torch.zeros(3, 8, 8, dtype=torch.uint8), "must be a uint8 tensor"),
-        ([], "no frames"),
-        ([[1]], "got list"),
-    ],
-)
-def test_other_things_than_frames_are_refused(frames, message):
-    with pytest.raises(UserError, match=message):
-        FrameCodec.fit(frames)
-
-
 def test_misfits_are_refused():
     frames = torch.zeros(2, 3, 24, 16, dtype=torch.uint8)
+    for wrong, said in ((frames.float(), "got torch.float32"), ([], "no frames"), ([[1]], "list")):
+        with pytest.raises(UserError, match=said):
+            FrameCodec.fit(wrong)
     with pytest.raises(UserError, match=r"tile size 16 does not divide .* 24 x 16 .* \[8\]"):
         FrameCodec.fit(frames, tile_size=16)
     with pytest.raises(UserError, match=r"frames are \[3, 16, 24\], this codec's .* \[3, 24, 16\]"):

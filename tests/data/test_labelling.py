@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage
@@ -59,7 +58,7 @@ def test_labels_are_what_the_expert_did(task, inverse):
 
 
 @pytest.mark.parametrize("task", ["move", "pick-out"])
-@pytest.mark.parametrize("preset", ["film", "strong"])
+@pytest.mark.parametrize("preset", ["strong"])
 def test_labels_read_from_tiles_are_those_read_from_pixels(task, preset, monkeypatch):
     demos = record_demonstrations(task, 40)
     model = make_inverse(demos, preset, seed=0)
@@ -144,19 +143,6 @@ def test_samples_are_the_demonstrations_own_transitions(inverse):
     assert torch.equal(buffer[sample["index"]]["instruction"], sample["instruction"])
 
 
-def test_samples_hold_what_was_asked_for_and_follow_the_generator():
-    demos, truth = record_demonstrations("move", 10, keep_truth=True)
-    buffers = [
-        labelled_buffer(
-            demos, truth.actions, generator=torch.Generator().manual_seed(3), batch_size=16
-        )
-        for _ in range(2)
-    ]
-    first, second = (buffer.sample() for buffer in buffers)
-    assert set(first.keys(True, True)) == {"pixels", "instruction", "action", "final", "index"}
-    assert (first == second).all()
-
-
 def test_a_selection_is_labelled_alone(inverse):
     demos = record_demonstrations("move-udlr", 30)
     chosen = demos[[7, 21]]
@@ -173,9 +159,6 @@ def test_the_model_is_evaluated_and_left_as_it_was(inverse):
     _, report = label_demonstrations(demos, inverse, progress=False)
     assert report.confidence.min() > 0.99 and not report.confidence.requires_grad
     assert inverse.training and inverse.module.training and not inverse.module.noise.training
-    with pytest.raises(UserError, match="wrote nothing at 'scores', not logits"):
-        label_demonstrations(demos, inverse, progress=False, logits_key="scores")
-    assert inverse.training and not inverse.module.noise.training
 
 
 def test_the_report_says_how_sure_the_model_was(inverse):
@@ -208,8 +191,6 @@ def test_a_saved_report_makes_the_buffer_again(tmp_path, inverse):
     assert torch.equal(buffer[:]["action"], report.actions.long())
     with pytest.raises(UserError, match="were they made for these demonstrations"):
         labelled_buffer(demos[:5], loaded.actions)
-    with pytest.raises(UserError, match="holds 'ifo-grounding labels', not"):
-        Demonstrations.load(tmp_path / "labels")
     LabelReport(report.actions, report.confidence, 2).save(tmp_path / "labels")
     with pytest.raises(UserError, match=r"an action outside 0\.\.1"):
         LabelReport.load(tmp_path / "labels")
@@ -233,6 +214,9 @@ def test_labels_fit_any_number_of_actions(tmp_path, n_actions, dtype):
 
 def test_bad_input_is_refused(inverse):
     demos = record_demonstrations("move", 5)
+    for label in (0.9, -1):
+        with pytest.raises(UserError, match="numbers of actions"):
+            labelled_buffer(demos, torch.full((demos.transitions,), label))
     with pytest.raises(UserError, match="batch_size must be"):
         label_demonstrations(demos, inverse, batch_size=0)
     frame, token = torch.zeros(1, 3, 8, 8, dtype=torch.uint8), torch.ones(1, 1).long()
@@ -244,28 +228,8 @@ def test_bad_input_is_refused(inverse):
         label_demonstrations(demos, flat, progress=False)
 
 
-def test_the_bar_counts_transitions(inverse, capsys):
-    demos = record_demonstrations("move", 5)
-    label_demonstrations(demos, inverse)
-    assert f"{demos.transitions}/{demos.transitions}" in capsys.readouterr().err
-
-
-def test_a_tensordict_of_one_demonstration_fits_the_model(inverse):
-    demos, truth = record_demonstrations("pick", 1, keep_truth=True)
-    frames = demos[0]["pixels"]
-    pair = TensorDict({"pixels": frames[:-1], "next": {"pixels": frames[1:]}}, [len(frames) - 1])
-    assert torch.equal(inverse.eval()(pair)["logits"].argmax(-1), truth.actions.long())
-
-
 def test_a_model_that_broke_labels_nothing():
     demos = record_demonstrations("move", 3)
     inverse = TensorDictModule(WatchTheArm(torch.nan), ["pixels", ("next", "pixels")], ["logits"])
     with pytest.raises(UserError, match="not all finite"):
         label_demonstrations(demos, inverse, progress=False)
-
-
-@pytest.mark.parametrize("label", [0.9, -1])
-def test_what_is_no_action_is_no_label(label):
-    demos = record_demonstrations("move", 3)
-    with pytest.raises(UserError, match="numbers of actions"):
-        labelled_buffer(demos, torch.full((demos.transitions,), label))

@@ -49,8 +49,8 @@ def test_placeholders_stand_for_actions_and_the_metadata_says_so(demos):
         assert episode.observations["image"][0] in dataset.observation_space["image"]
 
 
-def another(name, n=4, space=None, make=None, **storing):
-    """Make a dataset with real actions, such as somebody else would."""
+def another(name, n=4, space=None, make=None, cut=(), **storing):
+    """Make a dataset with real actions, such as somebody else would; some episodes are cut."""
     space = space or spaces.Dict({"view": BOX, "mission": spaces.Text(9)})
     make = make or (lambda views, n: {"view": views, "mission": [f"go {'on' * n}"] * len(views)})
     draw = np.random.default_rng(0)
@@ -60,8 +60,8 @@ def another(name, n=4, space=None, make=None, **storing):
             observations=make(shown, number),
             actions=np.arange(1, len(shown)),
             rewards=[1.0] * (len(shown) - 1),
-            terminations=[False] * (len(shown) - 1),
-            truncations=[True] * (len(shown) - 1),
+            terminations=[False] * (len(shown) - 2) + [number not in cut],
+            truncations=[False] * (len(shown) - 2) + [number in cut],
         )
         for number, shown in enumerate(views)
     ]
@@ -115,6 +115,44 @@ def test_actions_are_never_read(folder):
     assert torch.equal(all_frames(from_minari(table, image="view")), all_frames(expected))
 
 
+@pytest.mark.parametrize("kind", ["hdf5", "arrow"])
+def test_episodes_that_were_truncated_stay_open(kind):
+    dataset, views = another("other-v0", cut=(1,), data_format=kind)
+    demos = from_minari(dataset, image="view")
+    assert demos.closed.tolist() == [True, False, True, True]
+    assert len(demos[1]) == len(views[1])
+
+
+@pytest.mark.parametrize("where", ["link", "storage"])
+def test_what_lies_in_another_file_is_not_read(where, folder, tmp_path):
+    dataset, _ = another("other-v0")
+    with h5py.File(tmp_path / "other.hdf5", "w") as other:
+        other["view"] = np.zeros((4, *BOX.shape), np.uint8)
+    (tmp_path / "raw").write_bytes(bytes(4 * 40 * 48 * 3))
+    with h5py.File(folder / "other-v0" / "data" / "main_data.hdf5", "a") as file:
+        observed = file["episode_1/observations"]
+        del observed["view"]
+        if where == "link":
+            observed["view"] = h5py.ExternalLink(tmp_path / "other.hdf5", "view")
+        else:
+            stored = [(str(tmp_path / "raw"), 0, 4 * 40 * 48 * 3)]
+            observed.create_dataset("view", (4, *BOX.shape), np.uint8, external=stored)
+    with pytest.raises(UserError, match=r"episode 1 cannot be read .*(is a link|in another file)"):
+        from_minari(dataset, image="view")
+
+
+def test_grey_and_channels_first_images_are_read():
+    grey = spaces.Dict({"view": spaces.Box(0, 255, (40, 48), np.uint8), "mission": spaces.Text(9)})
+    make = lambda views, _: {"view": views[..., 0], "mission": ["go"] * len(views)}  # noqa: E731
+    demos = from_minari(another("grey-v0", 1, grey, make)[0], image="view")
+    assert demos.image_shape == (1, 40, 48)
+    first = spaces.Dict({"view": spaces.Box(0, 255, (3, 40, 48), np.uint8)})
+    make = lambda views, _: {"view": views.transpose(0, 3, 1, 2)}  # noqa: E731
+    dataset, views = another("first-v0", 2, first, make)
+    dataset.storage.update_metadata({"mission": "go on"})
+    assert np.array_equal(from_minari(dataset, image="view").first_frames()[1], views[1][0])
+
+
 def test_a_part_of_a_dataset_is_read():
     dataset, views = another("other-v0")
     long = dataset.filter_episodes(lambda episode: len(episode.rewards) > 3)
@@ -130,18 +168,6 @@ def test_the_instruction_may_be_in_the_metadata_of_an_episode():
         dataset.storage.update_episode_metadata([{"task": f"step {number}"}], [number])
     demos = from_minari(dataset, image="view", instruction="task")
     assert demos.sentences() == ["step 0", "step 1", "step 2"]
-
-
-def test_grey_and_channels_first_images_are_read():
-    grey = spaces.Dict({"view": spaces.Box(0, 255, (40, 48), np.uint8), "mission": spaces.Text(9)})
-    make = lambda views, _: {"view": views[..., 0], "mission": ["go"] * len(views)}  # noqa: E731
-    demos = from_minari(another("grey-v0", space=grey, make=make)[0], image="view")
-    assert demos.image_shape == (1, 40, 48)
-    first = spaces.Dict({"view": spaces.Box(0, 255, (3, 40, 48), np.uint8)})
-    make = lambda views, _: {"view": views.transpose(0, 3, 1, 2)}  # noqa: E731
-    dataset, views = another("first-v0", space=first, make=make)
-    dataset.storage.update_metadata({"mission": "go on"})
-    assert np.array_equal(from_minari(dataset, image="view").first_frames()[1], views[1][0])
 
 
 def changing(views, number):

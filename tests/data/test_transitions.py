@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 from torchrl.data import Categorical, LazyTensorStorage, OneHot
@@ -22,8 +21,6 @@ from ifo_grounding.data import (
     Demonstrations,
     RandomActions,
     collect_transitions,
-    record_demonstrations,
-    transitions,
 )
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
@@ -40,9 +37,9 @@ def unchanged(sample) -> torch.Tensor:
 
 
 def test_actions_explain_what_changed():
-    buffer, report = collect_transitions(make_env(), 2000, seed=1)
-    assert int(report.taken.sum()) == 2000
-    assert len(buffer) == int(report.kept.sum()) < 2000
+    buffer, report = collect_transitions(make_env(), 800, seed=1)
+    assert int(report.taken.sum()) == 800
+    assert len(buffer) == int(report.kept.sum()) < 800
     everything = buffer[:]
     action = everything["action"]
     assert torch.equal(action.bincount(minlength=6), report.kept)
@@ -60,40 +57,24 @@ def test_stops_are_kept_of_workers_in_processes(wrap):
     worker = partial(PickAndPlaceEnv, "pick", num_envs=4, seed=0, instructed=False)
     workers = wrap(ParallelEnv(2, worker, mp_start_method="fork"))
     try:
-        report = collect_transitions(workers, 400, seed=0).report
+        report = collect_transitions(workers, 100, seed=0).report
     finally:
         workers.close()
     assert int(report.kept[5]) == int(report.taken[5]) > 0
 
 
-def test_everything_is_kept_on_request():
-    env = make_env()
-    buffer, report = collect_transitions(env, 1500, drop_unchanged=False)
-    assert torch.equal(report.taken, report.kept)
-    everything = buffer[:]
-    bumps = unchanged(everything) & (everything["action"] != 5)
-    assert len(everything) == 1500 and 150 < bumps.sum() < 900
-
-
 def test_all_actions_are_equally_likely_by_default():
-    _, report = collect_transitions(make_env(), 3000)
-    assert (report.taken - 500).abs().max() < 90  # four standard deviations
+    _, report = collect_transitions(make_env(), 1200)
+    assert (report.taken - 200).abs().max() < 60  # four and a half standard deviations
 
 
 def test_the_stop_can_be_rare():
-    _, report = collect_transitions(make_env(), 3000, stop_probability=0.02)
-    assert abs(report.taken[5] - 60) < 31
-    assert (report.taken[:5] - 588).abs().max() < 90
-    _, report = collect_transitions(make_env(), 500, stop_probability=0.0)
+    _, report = collect_transitions(make_env(), 1200, stop_probability=0.02)
+    assert abs(report.taken[5] - 24) < 20
+    assert (report.taken[:5] - 235).abs().max() < 60
+    _, report = collect_transitions(make_env(), 100, stop_probability=0.0)
     assert report.taken[5] == 0
     assert str(report).splitlines()[6].split() == ["5", "0", "0"]
-
-
-def test_another_action_can_be_the_stop():
-    buffer, report = collect_transitions(make_env(), 1500, stop_action=4)
-    everything = buffer[:]
-    assert report.kept[5] == 0 and report.kept[4] == report.taken[4]
-    assert not unchanged(everything)[everything["action"] != 4].any()
 
 
 def test_same_seeds_same_transitions():
@@ -104,7 +85,7 @@ def test_same_seeds_same_transitions():
 
 
 def test_frames_are_stored_as_codes():
-    buffer, _ = collect_transitions(make_env(), 1000)
+    buffer, _ = collect_transitions(make_env(), 500)
     stored = buffer.storage.get(slice(None))
     assert stored.bytes() * 50 < buffer[:].exclude("index").bytes()
 
@@ -129,13 +110,6 @@ def test_wrapped_environments_serve_too():
             env.close()
 
 
-def test_the_buffer_takes_sampler_options():
-    buffer, _ = collect_transitions(
-        make_env(), 200, batch_size=7, generator=torch.Generator().manual_seed(0)
-    )
-    assert buffer.sample().shape == (7,)
-
-
 def test_a_transform_of_the_buffer_sees_images(tmp_path):
     """Not the codes that they are stored as."""
 
@@ -157,7 +131,7 @@ def test_a_transform_of_the_buffer_sees_images(tmp_path):
 
 def test_more_transitions_can_be_added():
     env = make_env()
-    buffer, _ = collect_transitions(env, 2000, stop_probability=0.02)
+    buffer, _ = collect_transitions(env, 300, stop_probability=0.02)
     count = len(buffer)
     more = buffer[:10].clone()
     buffer.extend(more)
@@ -180,13 +154,14 @@ def test_saved_transitions_are_the_same(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "message"),
+    ("change", "message"),
     [
-        ("pixels", lambda stored: stored["pixels"].fill_(120), "outside its dictionary"),
-        ("action", lambda stored: stored["action"].fill_(9), "unknown ones"),
+        (lambda stored: stored["pixels"].fill_(120), "codes hold tile 120"),
+        (lambda stored: stored["action"].fill_(9), "unknown ones"),
+        (lambda stored: stored.set("action", stored["action"].float()), "is damaged"),
     ],
 )
-def test_saved_nonsense_is_refused(name, change, message, tmp_path):
+def test_saved_nonsense_is_refused(change, message, tmp_path):
     collected = collect_transitions(make_env(), 50)
     change(collected.buffer.storage._storage)
     collected.save(tmp_path / "t")
@@ -218,44 +193,6 @@ def test_nothing_kept_is_said():
         collect_transitions(env, 1, seed=picks.index(True), **always_pick)
 
 
-def test_folders_of_others_are_left_alone(tmp_path):
-    found = collect_transitions(make_env(), 60)
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.tex").touch()
-    with pytest.raises(UserError, match=r"mine holds 'thesis\.tex', which would be deleted"):
-        found.save(tmp_path / "mine")
-    with pytest.raises(UserError, match="is a file: name a folder"):
-        found.save(tmp_path / "mine" / "thesis.tex")
-    for others in ("my_actions.npy", "meta.json"):
-        folder = tmp_path / others.partition(".")[0]
-        demos = record_demonstrations("move", 2, seed=0)
-        if others.endswith("npy"):
-            demos.save(folder)
-        else:
-            folder.mkdir()
-        (folder / others).write_text("[1, 2]")
-        with pytest.raises(UserError, match=f"holds '{others}', which would be deleted"):
-            demos.save(folder)
-        assert (folder / others).read_text() == "[1, 2]"
-    demos.save(tmp_path / "theirs")
-    with pytest.raises(UserError, match=r"theirs holds 'codes\.npy', which would be deleted"):
-        found.save(tmp_path / "theirs")
-    link = tmp_path / "link"
-    link.symlink_to(tmp_path / "made")
-    (tmp_path / "made").mkdir()
-    for _ in range(2):  # an older one is replaced
-        found.save(link)
-    assert link.is_symlink() and len(Collected.load(tmp_path / "made").buffer) == len(found.buffer)
-
-
-@pytest.mark.parametrize("stop", [np.int64(5), torch.tensor(5)])
-def test_a_stop_may_be_any_whole_number(stop):
-    env = make_env()
-    env.stop_action = stop
-    report = collect_transitions(env, 400, seed=0).report
-    assert report.kept[5] == report.taken[5] > 0
-
-
 def test_who_does_not_say_which_action_is_the_stop_is_asked():
     env = make_env()
     env.stop_action = "press"
@@ -268,25 +205,3 @@ def test_who_does_not_say_which_action_is_the_stop_is_asked():
     assert torch.equal(every.kept, every.taken)
     report = collect_transitions(silent, 40, stop_action=STOP).report
     assert report.kept[STOP] == report.taken[STOP]
-
-
-def test_counts_are_whole_numbers():
-    with pytest.raises(UserError, match=r"n must be a whole number, got 1000\.0"):
-        collect_transitions(make_env(), 1e3)
-    with pytest.raises(UserError, match=r"number of demonstrations must be a whole number"):
-        record_demonstrations("move", 1e2)
-
-
-@pytest.mark.parametrize("name", ["action", "taken", "pixels"])
-@pytest.mark.parametrize("change", [lambda x: x.float(), lambda x: x.flatten()[0]])
-def test_arrays_of_another_kind_are_damaged(name, change, tmp_path, monkeypatch):
-    collect_transitions(make_env(), 60).save(tmp_path / "found")
-    load = transitions.load_folder
-
-    def other(*args):
-        arrays, facts = load(*args)
-        return {**arrays, name: change(arrays[name])}, facts
-
-    monkeypatch.setattr(transitions, "load_folder", other)
-    with pytest.raises(UserError, match="found is damaged"):
-        Collected.load(tmp_path / "found")

@@ -3,10 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ifo_grounding.data import recombined, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import HOLDOUTS, N_TEMPLATES, PHRASINGS, SPLITS, TASKS, VOCABULARY, grammar
-from ifo_grounding.tasks.goals import suitable
 from ifo_grounding.tasks.grammar import FIELDS, holdout_kinds, in_split
 from ifo_grounding.world import COLOURS, SHAPES, kind, random_layout
 from reference import draw_goal
@@ -121,27 +119,6 @@ def test_tokens_are_parsed_row_by_row():
     rows = torch.tensor([5, 700, 5, 0])
     goals = known.parse_tokens(known.tokens[rows])
     assert (goals == known.goals[rows]).all()
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("n", [40, 2000])
-def test_whatever_words_are_exchanged_the_oracle_reads_it(task, n):
-    new = recombined(record_demonstrations(task, n, seed=1).pool())
-    assert len(grammar(task).parse_tokens(new)) == len(new)
-
-
-@pytest.mark.parametrize("task", ["pick-out", "pick-udlr"])
-def test_what_makes_no_sense_suits_no_state_and_is_said_by_nobody(task):
-    pool = record_demonstrations(task, 300, seed=0).pool()
-    new = recombined(pool)
-    goals = grammar(task).parse_tokens(new)
-    roles = ("source", "target") if task == "pick-out" else ("object", "reference")
-    senseless = goals[getattr(goals, roles[0]) == getattr(goals, roles[1])]
-    assert 0 < len(senseless) < len(new)
-    states = random_layout(len(senseless), generator=torch.Generator().manual_seed(0))
-    assert not suitable(states, senseless).any()
-    with pytest.raises(UserError, match=f"no sentence of {task}"):
-        grammar(task).encode(senseless, torch.zeros(len(senseless), dtype=torch.int64))
 
 
 def test_a_goal_that_no_sentence_expresses_is_refused():

@@ -14,7 +14,6 @@ from ifo_grounding.data.labelling import (
 )
 from ifo_grounding.data.minari import from_minari, to_minari
 from ifo_grounding.data.pictures import load_pictures, save_pictures
-from ifo_grounding.data.recombining import recombined
 from ifo_grounding.data.recording import record_demonstrations
 from ifo_grounding.data.transitions import (
     Collected,
@@ -45,7 +44,6 @@ __all__ = [
     "label_demonstrations",
     "labelled_buffer",
     "load_pictures",
-    "recombined",
     "record_babyai",
     "record_demonstrations",
     "save_pictures",

@@ -1,30 +1,171 @@
-"""Parts of demonstrations: checking them, and rows of episodes."""
+"""Episodes of others, one after the other: readers yield them, and one builder checks them."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.errors import UserError
+from ifo_grounding.tasks.vocabulary import Vocabulary
+
+PIECE_FRAMES = 512
+PIECE_BYTES = 16 << 20
+MOST_WORDS = 512
+"""Words that an instruction may have at most: all are padded to the longest."""
+LEAST_SIDE = 5
+"""Arrays whose last axis alone is shorter than this are taken for images with colours last."""
+
+Name = str | int
+Frames = Tensor | np.ndarray
+Episode = tuple[Name, Frames, str] | tuple[Name, Frames, str, bool]
+"""Name, frames uint8 [T + 1, C, H, W], instruction, and whether the recording was cut."""
 
 
-def check_parts(
-    codec: FrameCodec, codes: Tensor, lengths: Tensor, instructions: Tensor, vocabulary_size: int
-) -> None:
-    """Refuse parts that do not fit each other."""
-    if codes.shape[1:] != codec.code_shape or codes.dtype.is_floating_point:
-        raise UserError(
-            f"codes are {codes.dtype} {list(codes.shape)}, {codec} makes integers "
-            f"[F, {', '.join(map(str, codec.code_shape))}]"
+class Reader:
+    """Checks episodes one after the other, and notes all of them but the frames.
+
+    Args:
+        close: whether to repeat the last frame of episodes that do not end with a repeated frame.
+        vocabulary: the words that instructions may use; any by default.
+        length: words that an instruction may have, without a vocabulary.
+    """
+
+    def __init__(
+        self,
+        *,
+        close: bool = False,
+        vocabulary: Vocabulary | None = None,
+        length: int | None = None,
+    ) -> None:
+        self.close, self.vocabulary = close, vocabulary
+        self.length = vocabulary.length if vocabulary is not None else length or MOST_WORDS
+        self.lengths: list[int] = []
+        self.sentences: list[str] = []
+        self._first: tuple[Name, list[int]] | None = None
+
+    def pieces(self, episodes: Iterable[Episode]) -> Iterator[Tensor]:
+        """Yield frames of several episodes together, uint8 [F, C, H, W].
+
+        Raises:
+            UserError: naming the first episode that is not as it has to be.
+        """
+        waiting: list[Tensor] = []
+        for number, episode in enumerate(episodes):
+            if not isinstance(episode, tuple | list) or len(episode) not in (3, 4):
+                raise UserError(
+                    f"episode {number} is {_kind(episode)}: give a tuple of three, name, frames "
+                    "and instruction"
+                )
+            name, frames, sentence, *cut = episode
+            self.sentences.append(self._sentence(name, sentence))
+            waiting.append(self._frames(name, frames, self.close and not any(cut)))
+            self.lengths.append(len(waiting[-1]))
+            held = sum(part.nbytes for part in waiting)
+            if held >= PIECE_BYTES or sum(map(len, waiting)) >= PIECE_FRAMES:
+                yield torch.cat(waiting)
+                waiting = []
+        if not self.lengths:
+            raise UserError("there is no episode")
+        if waiting:
+            yield torch.cat(waiting)
+
+    def _sentence(self, name: Name, sentence: str) -> str:
+        if not isinstance(sentence, str) or not sentence.strip():
+            found = repr(sentence) if isinstance(sentence, str | None) else _kind(sentence)
+            raise UserError(f"episode {name!r} has no instruction (found {found}): give a sentence")
+        words = len(sentence.split())
+        if words > self.length:
+            longer = "length=" if self.vocabulary is None else "a vocabulary with length="
+            do = "shorten it" if words > MOST_WORDS else f"give {longer}{words}"
+            raise UserError(
+                f"episode {name!r} has an instruction of {words} words, {self.length} are allowed: "
+                + do
+            )
+        if self.vocabulary is not None:
+            with naming(name):
+                self.vocabulary.encode(sentence)
+        return sentence
+
+    def _frames(self, name: Name, given: Frames, close: bool) -> Tensor:
+        frames = check_frames(name, given)
+        shape = list(frames.shape[1:])
+        first, expected = self._first = self._first or (name, shape)
+        if shape != expected:
+            raise UserError(
+                f"episode {name!r} has images {shape}, the others have {expected} (such as episode "
+                f"{first!r}): scale them to one size"
+            )
+        if close and (len(frames) == 1 or not torch.equal(frames[-1], frames[-2])):
+            return torch.cat([frames, frames[-1:]])
+        return frames.clone()  # whoever gives episodes one by one may write to their array again
+
+
+def _kind(value: object) -> str:
+    sized = f" of {len(value)}" if isinstance(value, tuple | list) else ""
+    return f"a {type(value).__name__}{sized}"
+
+
+def check_frames(name: Name, given: Frames) -> Tensor:
+    """Return frames of an episode as a tensor.
+
+    Raises:
+        UserError: naming the episode, where they are not uint8 [T + 1, C, H, W], as far as that can
+            be seen: colours last are refused.
+    """
+    if given is None:
+        raise UserError(f"episode {name!r} has no frames")
+    try:
+        frames = (
+            given.cpu()
+            if isinstance(given, Tensor)
+            else torch.as_tensor(np.require(given, None, ["C", "W"]))
         )
-    if codec.tiles is None and codes.dtype != torch.uint8:
-        raise UserError(f"codes of {codec} are the pixels themselves, uint8, got {codes.dtype}")
+    except (TypeError, ValueError, RuntimeError):
+        raise UserError(f"episode {name!r}: its frames are not arrays of one size") from None
+    shape = list(frames.shape)
+    if not frames.numel():
+        wrong = f"is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at least one frame"
+    elif frames.is_floating_point():
+        scaled = "255 * frames" if frames.max() <= 1 else "frames"
+        wrong = (
+            f"is {frames.dtype} {shape} of {frames.min():g} to {frames.max():g}: give uint8 "
+            f"[T + 1, C, H, W], such as np.round({scaled}).astype(np.uint8)"
+        )
+    elif frames.dtype != torch.uint8 or frames.ndim != 4:
+        wrong = (
+            f"is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at least one frame; C is "
+            "1 for grey, 3 for colours, 4 with alpha"
+        )
+    elif shape[-1] < LEAST_SIDE <= min(shape[1:3]):
+        wrong = (
+            f"has images {shape[1:]}, with the colours last: give [T + 1, C, H, W], such as "
+            "frames.transpose(0, 3, 1, 2)"
+        )
+    else:
+        return frames
+    raise UserError(f"episode {name!r} {wrong}")
+
+
+@contextlib.contextmanager
+def naming(name: Name) -> Iterator[None]:
+    """Put the name of an episode before what is said of a mistake in it."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"episode {name!r}: {error}") from None
+
+
+def check_parts(frames: int, lengths: Tensor, instructions: Tensor, vocabulary_size: int) -> None:
+    """Refuse lengths and instructions that do not fit so many frames, or each other."""
     if lengths.ndim != 1 or lengths.dtype.is_floating_point or (lengths < 1).any():
         raise UserError("lengths must be an integer tensor [N] of frames per episode, at least 1")
-    if int(lengths.sum()) != len(codes):
-        raise UserError(f"lengths add up to {int(lengths.sum())} frames, there are {len(codes)}")
+    if int(lengths.sum()) != frames:
+        raise UserError(f"lengths add up to {int(lengths.sum())} frames, there are {frames}")
     if instructions.ndim != 2 or len(instructions) != len(lengths):
         raise UserError(
             f"instructions are {list(instructions.shape)}: give [N, L] for {len(lengths)} episodes"
@@ -38,30 +179,21 @@ def check_parts(
                 f"instructions hold token {low if low < 0 else high}: the vocabulary has ids "
                 f"0..{vocabulary_size - 1}"
             )
-    if codec.tiles is not None and codes.numel():
-        low, high = (int(value) for value in codes.aminmax())
-        if low < 0 or high >= len(codec.tiles):
-            raise UserError(
-                f"codes hold tile {low if low < 0 else high}: the dictionary has {len(codec.tiles)}"
-            )
 
 
-def refuse_empty(count: int, things: str = "demonstrations") -> None:
-    """Raise :class:`UserError` where there is nothing to make something of."""
-    if not count:
-        raise UserError(f"there are no {things}: is a selection, or the share of a split, empty?")
+def padded(instructions: Tensor, vocabulary: Vocabulary) -> Tensor:
+    """Return instructions as long as those that a vocabulary makes."""
+    missing = vocabulary.length - instructions.shape[-1] if instructions.ndim == 2 else 0
+    if missing < 0:
+        raise UserError(
+            f"instructions have {instructions.shape[-1]} tokens, those of the vocabulary "
+            f"{vocabulary.length}: make it with length={instructions.shape[-1]}"
+        )
+    return F.pad(instructions, (0, missing))
 
 
-def row_numbers(starts: Tensor, lengths: Tensor, padded: Tensor | None = None) -> Tensor:
+def row_numbers(starts: Tensor, lengths: Tensor, padded: Tensor) -> Tensor:
     """Return frame numbers of episodes in a row, the last one repeated up to ``padded`` lengths."""
-    padded = lengths if padded is None else padded
     begin = padded.cumsum(0) - padded
     step = torch.arange(int(padded.sum())) - begin.repeat_interleave(padded)
     return starts.repeat_interleave(padded) + step.minimum((lengths - 1).repeat_interleave(padded))
-
-
-def distinct_rows(tokens: Tensor) -> Tensor:
-    """Return the distinct rows in lexical order (rows are sorted as bytes: fast for many rows)."""
-    rows = np.ascontiguousarray(tokens.numpy().astype(">i4"))
-    as_bytes = rows.view([("", f"V{rows.shape[1] * 4}")]).reshape(-1)
-    return torch.from_numpy(rows[np.unique(as_bytes, return_index=True)[1]].astype(np.int64))

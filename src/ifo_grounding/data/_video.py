@@ -11,20 +11,23 @@ import numpy as np
 from PIL import Image
 
 from ifo_grounding.errors import UserError, extra
+from ifo_grounding.files import regular_file
 
 CODEC = "libx264"
+OPTIONS = {"format_whitelist": "mov,matroska,avi", "protocol_whitelist": "file"}
+"""A file that is a list of others, or of addresses, is no video."""
 
 
 def read_video(path: Path) -> Iterator[Image.Image]:
     """Yield the frames of a video as a player shows them, the right way up.
 
     Raises:
-        UserError: where it cannot be read, or ends before it says.
+        UserError: where it is no regular file or cannot be read, or ends before it says.
     """
     _, av = _libraries()
     whole, end = 0, 0.0
     try:
-        with av.open(str(path)) as video:
+        with av.open(f"file:{regular_file(path)}", options=OPTIONS) as video:
             if not video.streams.video:
                 raise UserError(f"{path} cannot be read (it shows nothing: is it cut short?)")
             stream = video.streams.video[0]
@@ -33,7 +36,8 @@ def read_video(path: Path) -> Iterator[Image.Image]:
                     whole += 1
                     end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
                 for frame in packet.decode():
-                    yield Image.fromarray(_upright(frame))
+                    pixels = frame.to_ndarray(format="rgb24")
+                    yield Image.fromarray(np.rot90(pixels, round(frame.rotation / 90)))
             expected, seconds, rate = stream.frames, _seconds(video, stream), stream.average_rate
     except (OSError, av.FFmpegError) as error:
         raise UserError(f"{path} cannot be read ({error})") from None
@@ -42,12 +46,6 @@ def read_video(path: Path) -> Iterator[Image.Image]:
         raise UserError(f"{path} is cut short: it ends at {end:.2f} s and says {seconds:.2f} s")
     if not seconds and whole < expected:
         raise UserError(f"{path} is cut short: it has {whole} frames and says {expected}")
-
-
-def _upright(frame: Any) -> np.ndarray:
-    """Return the pixels of a frame, uint8 [H, W, 3], turned as its display matrix says."""
-    pixels: np.ndarray = frame.to_ndarray(format="rgb24")
-    return np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))
 
 
 def _seconds(video: Any, stream: Any) -> float:

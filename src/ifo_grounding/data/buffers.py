@@ -1,4 +1,4 @@
-"""Replay buffers of demonstrations for the judges, which need no actions."""
+"""Replay buffers of demonstrations for the classifiers, which need no actions."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose
+from torchrl.envs import Transform
 
 from ifo_grounding import keys
-from ifo_grounding.data._episodes import refuse_empty
 from ifo_grounding.data._spool import same_rows
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
@@ -21,7 +20,7 @@ FINAL = "final"
 
 
 def first_frame_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer:
-    """Put first frames and instructions into a replay buffer: the instruction module's positives.
+    """Put first frames and instructions into a replay buffer, for the instruction classifier.
 
     A sample holds ``pixels`` uint8 [B, C, H, W] and ``instruction`` int64 [B, L].
 
@@ -39,21 +38,31 @@ def first_frame_buffer(demos: Demonstrations, **options: Any) -> TensorDictRepla
 
 
 def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer:
-    """Put final and earlier frames into a replay buffer, half of each, for the goal judge.
+    """Put final and earlier frames into a replay buffer, half of each, for the goal classifier.
 
     A sample holds ``initial_pixels`` and ``pixels`` uint8 [B, C, H, W], ``instruction`` int64
-    [B, L] and ``final`` bool [B, 1]. Earlier frames that look like the last one are left out: the
-    stop repeats it.
+    [B, L] and ``final`` bool [B, 1]. Earlier frames that are equal to the last one are left out:
+    the stop repeats it. Demonstrations that are open, without a stop, have no final frame here: a
+    recording that was cut shows no success.
 
     Args:
-        demos: demonstrations that end in success; the buffer shares their frames.
+        demos: demonstrations, of which those that are closed end in success (see
+            :meth:`~ifo_grounding.data.Demonstrations.close_episodes`); the buffer shares their
+            frames.
         options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``sampler``.
 
+    Raises:
+        UserError: where no demonstration is closed.
+
     >>> frames = [torch.arange(3, dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 48, 48)]
-    >>> buffer = goal_buffer(Demonstrations.from_arrays(frames, ["go up"]))
+    >>> buffer = goal_buffer(Demonstrations.from_arrays(frames, ["go up"]).close_episodes())
     >>> buffer[:]["final"].flatten().tolist()
     [False, False, True, True]
     """
+    refuse_empty(len(demos))
+    closed = demos.closed
+    if not closed.any():
+        raise UserError("no demonstration shows its stop: close_episodes() adds it")
     lengths = demos.lengths
     episode = torch.arange(len(demos)).repeat_interleave(lengths)
     step = torch.arange(len(episode)) - (lengths.cumsum(0) - lengths)[episode]
@@ -61,7 +70,7 @@ def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer
     last = demos.starts + lengths - 1
     earlier = ~same_rows(demos.codes, frame, last[episode])
     balance = torch.zeros(len(demos), dtype=torch.int64).scatter_add_(0, episode, earlier.long())
-    finished = torch.arange(len(demos)).repeat_interleave(balance.clamp(min=1))
+    finished = torch.arange(len(demos)).repeat_interleave(balance.clamp(min=1) * closed)
     episodes = torch.cat([episode[earlier], finished])
     final = torch.zeros(len(episodes), 1, dtype=torch.bool)
     final[int(earlier.sum()) :] = True
@@ -92,26 +101,42 @@ def frame_buffer(
     Raises:
         UserError: where there is no demonstration, or no entry, or a ``storage`` is given.
     """
-    if "storage" in options:
-        raise UserError(
-            "the storage is the buffer's own, which holds numbers of frames that are looked up "
-            "when they are sampled: leave storage out"
-        )
-    further = options.pop("transform", None)
     refuse_empty(len(demos))
     refuse_empty(len(stored[keys.INSTRUCTION]), "transitions")
     entries = TensorDict(stored, [len(stored[keys.INSTRUCTION])])
     for key in [*frame_keys, keys.INSTRUCTION]:
         entries[key] = entries[key].int()
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(len(entries)),
-        transform=Compose(
-            FrameDecoder(demos.codec, frame_keys, frames=demos.codes),
-            Lookup(demos.tokens, [keys.INSTRUCTION]),
-        ),
-        **options,
-    )
-    buffer.extend(entries)
-    if further is not None:
-        buffer.append_transform(further)  # it sees what is sampled, decoded
+    lookups = Lookup(demos.codes, frame_keys), Lookup(demos.instructions, [keys.INSTRUCTION])
+    return encoded_buffer(entries, [*lookups, FrameDecoder(demos.codec, frame_keys)], options)
+
+
+def encoded_buffer(
+    entries: TensorDict, transforms: list[Transform], options: dict[str, Any]
+) -> TensorDictReplayBuffer:
+    """Put entries that are encoded already into a buffer, which decodes what is sampled.
+
+    Args:
+        entries: what to store, [N].
+        transforms: what decodes it, in order.
+        options: for ``TensorDictReplayBuffer``; a ``transform`` sees what is decoded.
+
+    Raises:
+        UserError: where a ``storage`` is given.
+    """
+    if "storage" in options:
+        raise UserError(
+            "the storage is the buffer's own, which holds frames as codes or numbers: leave "
+            "storage out"
+        )
+    further = options.pop("transform", None)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(entries)), **options)
+    buffer.extend(entries)  # before the transforms come, which would encode it
+    for transform in transforms if further is None else [*transforms, further]:
+        buffer.append_transform(transform)
     return buffer
+
+
+def refuse_empty(count: int, things: str = "demonstrations") -> None:
+    """Raise :class:`UserError` where there is nothing to make something of."""
+    if not count:
+        raise UserError(f"there are no {things}: is a selection, or the share of a split, empty?")

@@ -12,7 +12,7 @@ from torch import Tensor
 from ifo_grounding import mosaic
 from ifo_grounding.data import _spool
 from ifo_grounding.data._spool import Spool, join
-from ifo_grounding.data._tile_index import TileIndex
+from ifo_grounding.data._tile_index import TileIndex, cut
 from ifo_grounding.errors import UserError
 
 TILE_SIZES = (8, 16, 32, 64)
@@ -53,16 +53,16 @@ class FrameCodec:
     def __init__(self, image_shape: Sequence[int], tiles: Tensor | None = None) -> None:
         channels, height, width = (int(side) for side in image_shape)
         self.image_shape = (channels, height, width)
+        self.tile_size: int | None = None
         self._index: TileIndex | None = None
         if tiles is not None:
-            self._index = TileIndex(mosaic.words(tiles).flatten(1))
-            side = tiles.shape[-1]
+            self._index = TileIndex(mosaic.words(tiles.cpu()).flatten(1))
+            side = self.tile_size = int(tiles.shape[-1])
             if tiles.shape[1:] != (channels, side, side) or height % side or width % side:
                 raise UserError(
                     f"tiles {list(tiles.shape)} do not cover images {list(self.image_shape)}: "
                     f"give [N, {channels}, T, T] with T a divisor of height and width"
                 )
-        self.tile_size = None if tiles is None else int(tiles.shape[-1])
 
     @property
     def tiles(self) -> Tensor | None:
@@ -166,30 +166,20 @@ class FrameCodec:
         """
         if not parts:
             raise UserError("no frames: give at least one part, integer [F, rows, columns]")
-        rows, columns = parts[0].shape[1:]
-        side = tiles.shape[-1]
+        given = join(parts, parts[0].dtype)
         used = torch.zeros(len(tiles), dtype=torch.bool)
-        for part in parts:
-            for piece in part.split(PIECE_FRAMES):
-                used[piece.flatten().long()] = True
+        for piece in given.split(PIECE_FRAMES):
+            used[piece.flatten().long()] = True
         distinct = TileIndex(torch.empty(0, tiles[0].numel() // mosaic.PIXELS_PER_WORD).long())
         numbers = torch.zeros(len(tiles), dtype=torch.int64)
         numbers[used] = distinct.add(mosaic.words(tiles[used]).flatten(1))
         order = torch.randperm(len(distinct), generator=generator)
-        numbers = order.argsort()[numbers]
         shown = distinct.words[order].view(torch.uint8).view(-1, *tiles.shape[1:])
-        codec = cls((tiles.shape[1], rows * side, columns * side), shown)
-
-        codes = torch.empty(sum(map(len, parts)), rows, columns, dtype=codec.code_dtype)
-        numbers = numbers.to(codec.code_dtype)
-        end = len(codes)
-        while parts:
-            part = parts.pop()
-            end -= len(part)
-            for offset in range(0, len(part), PIECE_FRAMES):
-                piece = part[offset : offset + PIECE_FRAMES]
-                codes[end + offset : end + offset + len(piece)] = numbers[piece.long()]
-        return codec, codes
+        rows, columns = (tiles.shape[-1] * count for count in given.shape[1:])
+        codec = cls((tiles.shape[1], rows, columns), shown)
+        numbers = order.argsort()[numbers].to(codec.code_dtype)
+        codes = [numbers[piece.long()] for piece in given.split(PIECE_FRAMES)]
+        return codec, join(codes, codec.code_dtype)
 
     def encode(self, frames: Tensor) -> Tensor:
         """Return the codes of ``frames``, uint8 [*B, C, H, W], as [*B, *code_shape].
@@ -209,7 +199,29 @@ class FrameCodec:
     def decode(self, codes: Tensor) -> Tensor:
         """Return the pixels of ``codes`` [*B, *code_shape], uint8 [*B, C, H, W]."""
         words = self.words
-        return codes if words is None else decode(words.to(codes.device), codes)
+        return codes if words is None else mosaic.assemble(words.to(codes.device), codes)
+
+    def check(self, codes: Tensor) -> None:
+        """Refuse codes, [F, *code_shape], that this codec cannot have made.
+
+        Raises:
+            UserError: that says what they are and what they should be.
+        """
+        if codes.shape[1:] != self.code_shape or codes.dtype.is_floating_point:
+            raise UserError(
+                f"codes are {codes.dtype} {list(codes.shape)}, {self} makes integers "
+                f"[F, {', '.join(map(str, self.code_shape))}]"
+            )
+        if self._index is None:
+            if codes.dtype != torch.uint8:
+                raise UserError(f"codes of {self} are the pixels, uint8, got {codes.dtype}")
+        elif codes.numel():
+            low, high = (int(value) for value in codes.aminmax())
+            if low < 0 or high >= len(self._index):
+                raise UserError(
+                    f"codes hold tile {low if low < 0 else high}: the dictionary has "
+                    f"{len(self._index)}"
+                )
 
     def _encode(self, frames: Tensor, grow: bool) -> Tensor:
         if _checked(frames, frames.ndim).shape[-3:] != self.image_shape:
@@ -243,40 +255,13 @@ class FrameCodec:
         if self._index is None or not frames:
             return 0.0
         pixels = math.prod(self.image_shape)
-        tiles = len(self._index) * pixels // math.prod(self.code_shape)
+        tiles = self._index.words.nbytes
         codes = frames * math.prod(self.code_shape) * self.code_dtype.itemsize
         return math.inf if tiles > _spool.MEMORY_BYTES else (tiles + codes) / (frames * pixels)
 
     def _give_up(self, codes: Spool) -> tuple[FrameCodec, Spool]:
         """Turn codes back into pixels and return them with a raw codec."""
         return FrameCodec(self.image_shape), codes.map(self.decode)
-
-
-def decode(words: Tensor, codes: Tensor) -> Tensor:
-    """Return pixels uint8 [*B, C, H, W] of tile numbers [*B, rows, columns]; see ``mosaic.words``.
-
-    Done in pieces that fit a processor's cache.
-    """
-    per_frame = words[0].numel() * math.prod(codes.shape[-2:]) * 8 if len(words) else 1
-    chunk = max(1, CHUNK_BYTES // max(per_frame, 1))
-    flat = codes.reshape(-1, *codes.shape[-2:])
-    if codes.is_cuda or len(flat) <= chunk:
-        return mosaic.assemble(words, codes)
-    channels, side = words.shape[1:3]
-    shape = (channels, codes.shape[-2] * side, codes.shape[-1] * side)
-    pixels = torch.empty(len(flat), *shape, dtype=torch.uint8)
-    for offset in range(0, len(flat), chunk):
-        pixels[offset : offset + chunk] = mosaic.assemble(words, flat[offset : offset + chunk])
-    return pixels.view(*codes.shape[:-2], *shape)
-
-
-def cut(frames: Tensor, tile_size: int) -> Tensor:
-    """Cut frames, uint8 [F, C, H, W], into tiles as words, int64 [F * rows * columns, K]."""
-    count, channels, height, width = frames.shape
-    words = mosaic.as_words(frames)
-    across = tile_size // mosaic.PIXELS_PER_WORD
-    grid = (count, channels, height // tile_size, tile_size, width // tile_size, across)
-    return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)
 
 
 def smallest_dtype(count: int) -> torch.dtype:
@@ -310,6 +295,5 @@ def _tile_size(frames: Tensor, total: int, asked: int | None) -> int | None:
     for size in fitting:
         codec = FrameCodec._empty(frames.shape[1:], size)
         code = codec.update(sample)[0]
-        tiles = codec.tiles
-        costs[size] = (0 if tiles is None else tiles.numel()) + total * code.nbytes
+        costs[size] = (0 if codec.words is None else codec.words.nbytes) + total * code.nbytes
     return min(costs, key=costs.__getitem__)

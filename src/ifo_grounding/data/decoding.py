@@ -10,8 +10,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from ifo_grounding import keys
-from ifo_grounding.data.codec import FrameCodec, decode
+from ifo_grounding import keys, mosaic
+from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.errors import UserError
 
 FRAME_KEYS: tuple[NestedKey, ...] = (keys.PIXELS, (keys.NEXT, keys.PIXELS))
@@ -20,16 +20,14 @@ FRAME_KEYS: tuple[NestedKey, ...] = (keys.PIXELS, (keys.NEXT, keys.PIXELS))
 class FrameDecoder(Transform):
     """Decodes frames when a replay buffer is sampled, and encodes them when it is extended.
 
-    The buffer stores codes of a :class:`~ifo_grounding.data.FrameCodec`, or, where ``frames`` is
-    given, rows of that table of codes, so that transitions share frames. ``buffer.transform.to(
-    device)`` makes it decode there.
+    The buffer stores codes of a :class:`~ifo_grounding.data.FrameCodec`. Where it stores numbers of
+    frames, so that transitions share them, put a :class:`Lookup` of the codes before this.
+    ``buffer.transform.to(device)`` makes it decode there.
 
     Args:
         codec: decodes codes, and encodes the pixels of new entries.
         in_keys: entries with codes; by default ``pixels`` and ``("next", "pixels")``.
         out_keys: where the pixels go; by default the same entries.
-        frames: codes of all frames, [F, *codec.code_shape]; entries are then integers [*B], and
-            the buffer takes no pixels.
 
     >>> import torch
     >>> from tensordict import TensorDict
@@ -43,26 +41,22 @@ class FrameDecoder(Transform):
     """
 
     words: Tensor | None
-    frames: Tensor | None
 
     def __init__(
         self,
         codec: FrameCodec,
         in_keys: Sequence[NestedKey] = FRAME_KEYS,
         out_keys: Sequence[NestedKey] | None = None,
-        frames: Tensor | None = None,
     ) -> None:
         out_keys = list(in_keys if out_keys is None else out_keys)
-        encodes = frames is None
         super().__init__(
             in_keys=list(in_keys),
             out_keys=out_keys,
-            in_keys_inv=list(in_keys) if encodes else [],
-            out_keys_inv=list(out_keys) if encodes else [],
+            in_keys_inv=list(in_keys),
+            out_keys_inv=list(out_keys),
         )
         self.codec, self._code_dtype = codec, codec.code_dtype
-        self.register_buffer("words", codec.words, persistent=encodes)
-        self.register_buffer("frames", frames, persistent=False)
+        self.register_buffer("words", codec.words)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Decode the entries of a sample."""
@@ -72,11 +66,9 @@ class FrameDecoder(Transform):
         return super().forward(_follow(tensordict, self.words))
 
     def _apply_transform(self, codes: Tensor) -> Tensor:
-        if self.frames is not None:
-            codes = self.frames[codes.to(self.frames.device).long()]
         if self.words is None:
             return codes
-        return decode(self.words, codes.to(self.words.device))
+        return mosaic.assemble(self.words, codes.to(self.words.device))
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         encoded = super()._inv_call(tensordict)
@@ -97,7 +89,7 @@ class FrameDecoder(Transform):
     ) -> None:
         """Load a dictionary as a new one, for that of the codec may be in use elsewhere."""
         words = state_dict.get(f"{prefix}words")
-        if self.frames is None and self.words is not None and words is not None:
+        if self.words is not None and words is not None:
             tiles = words.cpu().clone().view(torch.uint8)
             self.codec = FrameCodec(self.codec.image_shape, tiles)
             self._code_dtype = self.codec.code_dtype
@@ -109,7 +101,7 @@ class Lookup(Transform):
     """Replaces row numbers by rows of a table when a replay buffer is sampled.
 
     Args:
-        table: [N, *S]; integers come out as int64.
+        table: [N, *S].
         in_keys: entries with row numbers, integer [*B].
         out_keys: where the rows go, [*B, *S]; by default the same entries.
 
@@ -138,8 +130,7 @@ class Lookup(Transform):
         return super().forward(_follow(tensordict, self.table))
 
     def _apply_transform(self, number: Tensor) -> Tensor:
-        rows = self.table[number.to(self.table.device).long()]
-        return rows if rows.dtype.is_floating_point else rows.long()
+        return self.table[number.to(self.table.device).long()]
 
 
 def _follow(tensordict: TensorDictBase, table: Tensor | None) -> TensorDictBase:

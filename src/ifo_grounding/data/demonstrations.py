@@ -10,23 +10,20 @@ from typing import Any, overload
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import Tensor
 
 from ifo_grounding import keys
-from ifo_grounding.data._episodes import check_parts, distinct_rows, refuse_empty, row_numbers
-from ifo_grounding.data._reading import Episode, Reader
+from ifo_grounding.data._episodes import Episode, Reader, check_parts, padded, row_numbers
 from ifo_grounding.data._spool import same_rows, take
 from ifo_grounding.data.codec import FrameCodec
-from ifo_grounding.data.folder import DAMAGED, fact, load_folder, save_folder
+from ifo_grounding.data.folder import damaged, load_folder, save_folder
+from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError, whole
 from ifo_grounding.seeding import generator as seeded
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 KIND = "ifo-grounding demonstrations"
-VERSION = 1
-MASK = "mask"
 
 
 class Demonstrations:
@@ -51,20 +48,20 @@ class Demonstrations:
     >>> demos = Demonstrations.from_arrays(frames, ["go up"] * 5)
     >>> len(demos), demos.transitions, demos[0]["pixels"].shape
     (5, 10, torch.Size([3, 3, 48, 48]))
-    >>> sorted(demos.sample_transitions(4).keys(True, True), key=str)
-    [('next', 'pixels'), 'instruction', 'pixels']
+    >>> demos[:2].sentences()
+    ['go up', 'go up']
     """
 
     __slots__ = (
-        "_lengths",
-        "_starts",
-        "_transition_ends",
-        "codec",
-        "codes",
-        "tokens",
-        "vocabulary",
-        "vocabulary_size",
+        *("codec", "codes", "lengths", "starts", "tokens"),
+        *("vocabulary", "vocabulary_size"),
     )
+    lengths: Tensor
+    """Frames of each episode, int64 [N]."""
+    starts: Tensor
+    """Number of each episode's first frame, for :meth:`frames`, int64 [N]."""
+    tokens: Tensor
+    """The instructions in few bytes, integer [N, L]; see :attr:`instructions`."""
 
     def __init__(
         self,
@@ -78,20 +75,18 @@ class Demonstrations:
     ) -> None:
         if vocabulary is not None:
             vocabulary_size = len(vocabulary)
-            instructions = _padded(instructions, vocabulary)
+            instructions = padded(instructions, vocabulary)
         elif vocabulary_size is None:
             vocabulary_size = int(instructions.max()) + 1 if instructions.numel() else 1
         vocabulary_size = whole("vocabulary_size", vocabulary_size)
-        check_parts(codec, codes, lengths, instructions, vocabulary_size)
+        codec.check(codes)
+        check_parts(len(codes), lengths, instructions, vocabulary_size)
         self.codec, self.codes = codec, codes
         self.vocabulary, self.vocabulary_size = vocabulary, vocabulary_size
-        lengths = lengths.long()
+        self.lengths = lengths.long()
+        self.starts = self.lengths.cumsum(0) - self.lengths
         small = torch.int16 if vocabulary_size <= torch.iinfo(torch.int16).max else torch.int32
-        self._set_episodes(lengths.cumsum(0) - lengths, lengths, instructions.to(small))
-
-    def _set_episodes(self, starts: Tensor, lengths: Tensor, tokens: Tensor) -> None:
-        self._starts, self._lengths, self.tokens = starts, lengths, tokens
-        self._transition_ends = (lengths - 1).cumsum(0)
+        self.tokens = instructions.to(small)
 
     @classmethod
     def from_arrays(
@@ -106,8 +101,7 @@ class Demonstrations:
         """Take frames from elsewhere, as they are: :meth:`close_episodes` adds stops.
 
         Args:
-            frames: one uint8 array [T + 1, C, H, W] per episode, at least two frames; a generator
-                is read in pieces.
+            frames: one uint8 array [T + 1, C, H, W] per episode; a generator is read in pieces.
             instructions: token ids, integer [N, L], or sentences.
             vocabulary: the words of the sentences or tokens; by default that of the sentences.
             length: words that the longest sentence may have, without a vocabulary; by default
@@ -142,8 +136,9 @@ class Demonstrations:
         """Take episodes one after the other: pixels of a few are in memory at a time.
 
         Args:
-            episodes: name, frames and instruction of each; frames are uint8 [T + 1, C, H, W], at
-                least two. A generator is read once.
+            episodes: name, frames and instruction of each; frames are uint8 [T + 1, C, H, W]. True
+                as a fourth entry says that the recording was cut: its last frame is no stop, and
+                stays as it is. A generator is read once.
             vocabulary: the words of the instructions; by default those that occur.
             length: words that the longest instruction may have, without a vocabulary; by default
                 those of the longest that occurs.
@@ -166,10 +161,8 @@ class Demonstrations:
         tokens = words.encode(sentences)
         return cls(codec, codes, torch.tensor(reader.lengths), tokens, vocabulary=words)
 
-    # ---- What there is ----------------------------------------------------------------------
-
     def __len__(self) -> int:
-        return len(self._lengths)
+        return len(self.lengths)
 
     def __repr__(self) -> str:
         return f"Demonstrations({len(self)} episodes, {self.n_frames} frames, {self.codec})"
@@ -177,22 +170,12 @@ class Demonstrations:
     @property
     def n_frames(self) -> int:
         """Frames of all episodes."""
-        return int(self._lengths.sum())
+        return int(self.lengths.sum())
 
     @property
     def transitions(self) -> int:
         """Pairs of a frame and the next one."""
         return self.n_frames - len(self)
-
-    @property
-    def lengths(self) -> Tensor:
-        """Frames of each episode, int64 [N]."""
-        return self._lengths
-
-    @property
-    def starts(self) -> Tensor:
-        """Number of each episode's first frame, for :meth:`frames`, int64 [N]."""
-        return self._starts
 
     @property
     def instructions(self) -> Tensor:
@@ -217,9 +200,15 @@ class Demonstrations:
     @property
     def nbytes(self) -> int:
         """Bytes of codes, tiles, tokens and lengths."""
-        tiles = self.codec.tiles
-        own = (self.codes, self.tokens, self._lengths, self._starts, self._transition_ends)
-        return sum(part.nbytes for part in own) + (0 if tiles is None else tiles.nbytes)
+        parts = (self.codes, self.tokens, self.lengths, self.starts, self.codec.tiles)
+        return sum(part.nbytes for part in parts if part is not None)
+
+    @property
+    def closed(self) -> Tensor:
+        """Whether each episode shows its stop, a repeated last frame, bool [N]."""
+        last = self.starts + self.lengths - 1
+        before = (last - 1).maximum(self.starts)
+        return same_rows(self.codes, last, before) & (self.lengths > 1)
 
     def sentences(self) -> list[str]:
         """Return the instructions as text."""
@@ -228,10 +217,8 @@ class Demonstrations:
         return self.vocabulary.decode(self.instructions)
 
     def pool(self) -> Tensor:
-        """Return the distinct instructions, int64 [P, L]."""
-        return distinct_rows(self.tokens).long()
-
-    # ---- Episodes ---------------------------------------------------------------------------
+        """Return the distinct instructions in lexical order of their tokens, int64 [P, L]."""
+        return distinct_rows(self.instructions)[0].unique(dim=0)
 
     @overload
     def __getitem__(self, index: int) -> TensorDict: ...
@@ -242,23 +229,23 @@ class Demonstrations:
         if isinstance(index, str | tuple):
             raise UserError(
                 f"demonstrations have no entry {index!r}: they hold pixels and instructions, which "
-                "demos[i], frames, instructions and the sample methods return"
+                "demos[i], frames and instructions return"
             )
         if not isinstance(index, slice) and not np.ndim(index):
             index = whole("the number of a demonstration", index)
             if not -len(self) <= index < len(self):
                 raise IndexError(f"demonstration {index} of {len(self)}")
-            first, length = int(self._starts[index]), int(self._lengths[index])
+            first, length = int(self.starts[index]), int(self.lengths[index])
             tokens = self.tokens[index].long().expand(length, -1)
             pixels = self.frames(torch.arange(first, first + length))
             return TensorDict({keys.PIXELS: pixels, keys.INSTRUCTION: tokens}, [length])
-        if isinstance(index, slice) and (index.step or 1) < 0:  # tensors know no such slices
+        if isinstance(index, slice):
             index = list(range(len(self))[index])
-        if not isinstance(index, slice):
-            index = torch.as_tensor(index).cpu()
-            index = index if index.dtype == torch.bool else index.long()
+        index = torch.as_tensor(index).cpu()
+        index = index if index.dtype == torch.bool else index.long()
         chosen = copy.copy(self)
-        chosen._set_episodes(self._starts[index], self._lengths[index], self.tokens[index])
+        for name in ("starts", "lengths", "tokens"):
+            setattr(chosen, name, getattr(self, name)[index])
         return chosen
 
     def split(self, fraction: float, seed: int = 0) -> tuple[Demonstrations, Demonstrations]:
@@ -272,14 +259,12 @@ class Demonstrations:
     def close_episodes(self) -> Demonstrations:
         """Repeat the last frame of each episode that does not end with a repeated frame.
 
-        For demonstrations recorded without the frame after the stop. It takes for granted that
-        demonstrators waste no step: an unchanged frame means that they had stopped.
+        For demonstrations recorded without the frame after the stop, not for recordings that were
+        cut. It takes for granted that demonstrators waste no step: an unchanged frame means that
+        they had stopped.
         """
-        last = self._starts + self._lengths - 1
-        before = (last - 1).maximum(self._starts)
-        open_ended = ~same_rows(self.codes, last, before) | (self._lengths == 1)
-        lengths = self._lengths + open_ended
-        codes = take(self.codes, row_numbers(self._starts, self._lengths, lengths))
+        lengths = self.lengths + ~self.closed
+        codes = take(self.codes, row_numbers(self.starts, self.lengths, lengths))
         return Demonstrations(
             self.codec,
             codes,
@@ -289,19 +274,13 @@ class Demonstrations:
             vocabulary_size=self.vocabulary_size,
         )
 
-    # ---- Frames -----------------------------------------------------------------------------
-
     def frames(self, number: Tensor) -> Tensor:
         """Return frames by number [*B] (row of ``codes``), uint8 [*B, C, H, W]."""
         return self.codec.decode(self.codes[number.long().cpu()])
 
     def first_frames(self, index: Tensor | slice = slice(None)) -> Tensor:
         """Return the first frames of some episodes, uint8 [*B, C, H, W]."""
-        return self.frames(self._starts[_on_cpu(index)])
-
-    def last_frames(self, index: Tensor | slice = slice(None)) -> Tensor:
-        """Return the last frames of some episodes, uint8 [*B, C, H, W]."""
-        return self.frames((self._starts + self._lengths - 1)[_on_cpu(index)])
+        return self.frames(self.starts[index.cpu() if isinstance(index, Tensor) else index])
 
     def locate(self, transition: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the episode and the number of the first frame of transitions, int64 [*B] each.
@@ -310,62 +289,18 @@ class Demonstrations:
         """
         if transition is None:
             transition = torch.arange(self.transitions)
-        episode = torch.searchsorted(self._transition_ends, transition, right=True)
-        begin = self._transition_ends[episode] - (self._lengths[episode] - 1)
-        return episode, self._starts[episode] + transition - begin
-
-    def sample_transitions(
-        self, batch: int, generator: torch.Generator | None = None
-    ) -> TensorDict:
-        """Draw transitions at random, with repetition.
-
-        Returns:
-            A TensorDict [batch] of ``pixels``, ``instruction`` and ``("next", "pixels")``.
-        """
-        if not self.transitions:
-            raise UserError("there are no transitions: no episode has two frames")
-        drawn = torch.randint(self.transitions, (batch,), generator=generator)
-        episode, frame = self.locate(drawn)
-        return TensorDict(
-            {
-                keys.PIXELS: self.frames(frame),
-                keys.INSTRUCTION: self.tokens[episode].long(),
-                keys.NEXT: {keys.PIXELS: self.frames(frame + 1)},
-            },
-            [batch],
-        )
-
-    def sample_episodes(self, n: int, generator: torch.Generator | None = None) -> TensorDict:
-        """Draw whole demonstrations at random, with repetition.
-
-        Returns:
-            A TensorDict [n, T + 1] of ``pixels``, ``instruction``, ``mask`` (true for real frames);
-            shorter episodes are padded with their last frame.
-        """
-        refuse_empty(len(self))
-        episode = torch.randint(len(self), (n,), generator=generator)
-        lengths = self._lengths[episode].unsqueeze(1)
-        time = torch.arange(int(lengths.max()) if n else 0)
-        number = self._starts[episode].unsqueeze(1) + time.minimum(lengths - 1)
-        tokens = self.tokens[episode].long().unsqueeze(1).expand(-1, len(time), -1)
-        return TensorDict(
-            {
-                keys.PIXELS: self.frames(number),
-                keys.INSTRUCTION: tokens,
-                MASK: time < lengths,
-            },
-            [n, len(time)],
-        )
-
-    # ---- Files ------------------------------------------------------------------------------
+        steps = self.lengths - 1
+        ends = steps.cumsum(0)
+        episode = torch.searchsorted(ends, transition, right=True)
+        return episode, self.starts[episode] + transition - (ends - steps)[episode]
 
     def save(self, folder: str | Path) -> None:
         """Write a folder of ``.npy`` files and ``meta.json``; of a selection, its frames alone."""
-        in_a_row = torch.equal(self._starts, self._lengths.cumsum(0) - self._lengths)
+        in_a_row = torch.equal(self.starts, self.lengths.cumsum(0) - self.lengths)
         whole = in_a_row and self.n_frames == len(self.codes)
-        rows = row_numbers(self._starts, self._lengths)
+        rows = row_numbers(self.starts, self.lengths, self.lengths)
         codes = self.codes if whole else take(self.codes, rows)
-        arrays = {"codes": codes, "lengths": self._lengths, "instructions": self.tokens}
+        arrays = {"codes": codes, "lengths": self.lengths, "instructions": self.tokens}
         if self.codec.tiles is not None:
             arrays["tiles"] = self.codec.tiles
         words = None if self.vocabulary is None else list(self.vocabulary.words)
@@ -374,7 +309,7 @@ class Demonstrations:
             "words": words,
             "vocabulary_size": self.vocabulary_size,
         }
-        save_folder(folder, KIND, VERSION, arrays, facts)
+        save_folder(folder, KIND, arrays, facts)
 
     @classmethod
     def load(cls, folder: str | Path) -> Demonstrations:
@@ -383,36 +318,16 @@ class Demonstrations:
         Raises:
             UserError: where the folder is damaged, truncated or foreign, with what is wrong.
         """
-        arrays, facts = load_folder(
-            folder, KIND, VERSION, ("codes", "lengths", "instructions"), ("tiles",)
-        )
-        try:
-            words = fact(facts, "words", (list, type(None)))
-            tokens = arrays["instructions"]
-            vocabulary = None if words is None else Vocabulary(words, tokens.shape[-1])
+        names = ("codes", "lengths", "instructions")
+        arrays, facts = load_folder(folder, KIND, names, ("tiles",))
+        with damaged(folder):
+            codes, lengths, tokens = (arrays[name] for name in names)
+            words = facts["words"]
             return cls(
-                FrameCodec(fact(facts, "image_shape", list), arrays.get("tiles")),
-                arrays["codes"],
-                arrays["lengths"],
+                FrameCodec(facts["image_shape"], arrays.get("tiles")),
+                codes,
+                lengths,
                 tokens,
-                vocabulary=vocabulary,
-                vocabulary_size=fact(facts, "vocabulary_size", int),
+                vocabulary=None if words is None else Vocabulary(words, tokens.shape[-1]),
+                vocabulary_size=facts["vocabulary_size"],
             )
-        except DAMAGED as error:
-            raise UserError(f"{folder} is damaged: {error}") from None
-
-
-def _padded(instructions: Tensor, vocabulary: Vocabulary) -> Tensor:
-    """Return instructions as long as those that a vocabulary makes."""
-    missing = vocabulary.length - instructions.shape[-1] if instructions.ndim == 2 else 0
-    if missing < 0:
-        raise UserError(
-            f"instructions have {instructions.shape[-1]} tokens, those of the vocabulary "
-            f"{vocabulary.length}: make it with length={instructions.shape[-1]}"
-        )
-    return F.pad(instructions, (0, missing)) if missing else instructions
-
-
-def _on_cpu(index: Any) -> Any:
-    """Return an index of what lies in main memory, whatever kind it is of."""
-    return index.cpu() if isinstance(index, Tensor) else index

@@ -2,38 +2,35 @@
 
 from __future__ import annotations
 
+import contextlib
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ifo_grounding.data._spool import is_mapped, pieces, release
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import atomic_write, read_json, write_json
 
 META = "meta.json"
+VERSION = 1
+"""Version of the format, the only one that is read."""
 BLOCK_BYTES = 1 << 20
 DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RuntimeError)
 """What arrays raise that are not what a reader takes them for, NotImplementedError among them."""
 
 
 def save_folder(
-    folder: str | Path,
-    kind: str,
-    version: int,
-    arrays: Mapping[str, Tensor],
-    facts: Mapping[str, Any],
+    folder: str | Path, kind: str, arrays: Mapping[str, Tensor], facts: Mapping[str, Any]
 ) -> None:
     """Write tensors and facts (whatever JSON can say) as a folder, replacing an older one at once.
 
     Args:
         folder: where to; it appears when everything is written.
         kind: what the folder holds, such as ``"ifo-grounding demonstrations"``.
-        version: version of that format.
         arrays: tensors by name; each becomes ``name.npy``.
         facts: what else a reader needs.
 
@@ -47,17 +44,10 @@ def save_folder(
         listed = {}
         for name, tensor in arrays.items():
             path = temporary / f"{name}.npy"
-            _save_array(path, tensor)
-            listed[name] = {
-                "dtype": str(tensor.dtype).removeprefix("torch."),
-                "shape": list(tensor.shape),
-                "bytes": path.stat().st_size,
-                "crc32": _checksum(path),
-            }
-        write_json(
-            temporary / META,
-            {"format": kind, "version": version, "arrays": listed, "facts": dict(facts)},
-        )
+            np.save(path, tensor.detach().cpu().numpy(), allow_pickle=False)
+            listed[name] = {"crc32": _checksum(path)}
+        meta = {"format": kind, "version": VERSION, "arrays": listed, "facts": dict(facts)}
+        write_json(temporary / META, meta)
 
 
 def _check_ours(folder: Path, kind: str) -> None:
@@ -66,19 +56,12 @@ def _check_ours(folder: Path, kind: str) -> None:
         if folder.exists():
             raise UserError(f"{folder} is a file: name a folder")
         return
-    try:
-        found = sorted(path.name for path in folder.iterdir())
-        meta: Any = read_json(folder / META) if META in found else None
-    except FileNotFoundError:  # another writer has just put it away
-        return
-    except UserError:
-        if not (folder / META).exists():
-            return
-        raise
-    ours = isinstance(meta, dict) and meta.get("format") == kind
-    arrays = meta.get("arrays") if ours else None
-    listed = {f"{name}.npy" for name in arrays} if isinstance(arrays, dict) else set()
-    if others := [name for name in found if name not in listed and not (ours and name == META)]:
+    ours: set[str] = set()
+    if (folder / META).exists():
+        meta = read_json(folder / META)
+        if isinstance(meta, dict) and meta.get("format") == kind:
+            ours = {META, *(f"{name}.npy" for name in meta.get("arrays") or ())}
+    if others := sorted({path.name for path in folder.iterdir()} - ours):
         raise UserError(
             f"{folder} holds {others[0]!r}, which would be deleted: name another folder, or an "
             "empty one"
@@ -86,18 +69,15 @@ def _check_ours(folder: Path, kind: str) -> None:
 
 
 def load_folder(
-    folder: str | Path,
-    kind: str,
-    version: int,
-    names: Collection[str],
-    optional: Collection[str] = (),
+    folder: str | Path, kind: str, names: Collection[str], optional: Collection[str] = ()
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what :func:`save_folder` wrote; tensors stay on disk and are read as they are used.
+
+    Nothing is unpickled.
 
     Args:
         folder: where from.
         kind: what the folder must hold.
-        version: the only version that is read.
         names: arrays that must be there.
         optional: arrays that may be there. Others are refused.
 
@@ -105,17 +85,15 @@ def load_folder(
         UserError: that says what is missing, damaged or foreign.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder of {kind}")
-    if not (folder / META).exists():
+    if not (folder / META).is_file():
         raise UserError(f"{folder} is not a folder of {kind}: it has no {META}")
     meta = read_json(folder / META)
-    if not isinstance(meta, dict) or meta.get("format") != kind:
-        found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
+    found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
+    if found != kind:
         raise UserError(f"{folder} holds {found!r}, not {kind!r}")
-    if meta.get("version") != version:
+    if meta.get("version") != VERSION:
         raise UserError(
-            f"{folder} is of version {meta.get('version')!r}, this library reads {version}: "
+            f"{folder} is of version {meta.get('version')!r}, this library reads {VERSION}: "
             "record it again or use the library that wrote it"
         )
     listed, facts = meta.get("arrays"), meta.get("facts")
@@ -125,65 +103,28 @@ def load_folder(
         raise UserError(f"{folder / META} does not list {', '.join(missing)}: it is damaged")
     if foreign := sorted(set(listed) - set(names) - set(optional)):
         raise UserError(f"{folder} holds {', '.join(foreign)}, which {kind} have no place for")
+    with damaged(folder):
+        return {name: _load_array(folder / f"{name}.npy", listed[name]) for name in listed}, facts
+
+
+@contextlib.contextmanager
+def damaged(folder: str | Path) -> Iterator[None]:
+    """Say that a folder is damaged, where what was read of it makes a mistake."""
     try:
-        arrays = {name: _load_array(folder / f"{name}.npy", listed[name]) for name in listed}
-    except FileNotFoundError:
-        raise UserError(f"{folder} was replaced while it was read: read it again") from None
-    return arrays, facts
+        yield
+    except DAMAGED as error:
+        raise UserError(f"{folder} is damaged: {error}") from None
 
 
-def _save_array(path: Path, tensor: Tensor) -> None:
-    array = tensor.detach().cpu().numpy()
-    if not is_mapped(tensor):
-        np.save(path, array, allow_pickle=False)
-        return
-    with path.open("wb") as target:
-        header = np.lib.format.header_data_from_array_1_0(array)
-        np.lib.format.write_array_header_1_0(target, header)
-        for piece in pieces(tensor):
-            target.write(piece.numpy().data)
-            release(tensor)
-
-
-def fact(facts: Mapping[str, Any], name: str, kinds: type | tuple[type, ...]) -> Any:
-    """Return one fact, or refuse the folder where it is missing or of another type."""
-    if not isinstance(facts.get(name), kinds) or name not in facts:
-        raise UserError(f"{META} has no usable {name!r} (found {facts.get(name)!r}): it is damaged")
-    return facts[name]
-
-
-def _load_array(path: Path, expected: Any) -> Tensor:
-    if not isinstance(expected, dict):
-        raise UserError(f"{path.parent / META} describes {path.name} wrongly: it is damaged")
-    if not path.exists():
-        raise UserError(f"{path} is missing: restore it or record the folder again")
-    size = path.stat().st_size
-    if size != expected.get("bytes"):
-        raise UserError(
-            f"{path} has {size} bytes, {META} says {expected.get('bytes')}: "
-            "it is truncated or foreign"
-        )
-    if _checksum(path) != expected.get("crc32"):
-        raise UserError(f"{path} is damaged: its checksum differs from the one in {META}")
+def _load_array(path: Path, expected: Mapping[str, Any]) -> Tensor:
+    if not path.is_file():
+        raise UserError(f"{path.name} is missing: restore it or record the folder again")
+    if _checksum(path) != expected["crc32"]:
+        raise UserError(f"the checksum of {path.name} is not the one in {META}")
     try:
-        mode: Literal["c"] | None = "c" if _has_items(expected) else None
-        array = np.load(path, mmap_mode=mode, allow_pickle=False)
-        tensor = torch.from_numpy(array)
-    except (ValueError, TypeError, EOFError, OSError) as error:
-        raise UserError(f"{path} is not a readable .npy file: {error}") from None
-    found = (str(tensor.dtype).removeprefix("torch."), list(tensor.shape))
-    if found != (expected.get("dtype"), expected.get("shape")):
-        raise UserError(
-            f"{path} holds {found[0]} {found[1]}, {META} says "
-            f"{expected.get('dtype')} {expected.get('shape')}"
-        )
-    return tensor
-
-
-def _has_items(expected: Mapping[str, Any]) -> bool:
-    """Tell whether an array has any items: an empty one cannot be mapped into memory."""
-    shape = expected.get("shape")
-    return isinstance(shape, list) and all(shape)
+        return torch.from_numpy(np.load(path, mmap_mode="c", allow_pickle=False))
+    except ValueError:  # an array without items cannot be mapped
+        return torch.from_numpy(np.load(path, allow_pickle=False))
 
 
 def _checksum(path: Path) -> int:

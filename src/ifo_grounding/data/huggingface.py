@@ -13,12 +13,11 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import refuse_empty
-from ifo_grounding.data._reading import Episode, stack_pictures
+from ifo_grounding.data._episodes import Episode
+from ifo_grounding.data._images import BROKEN, open_image, stack_images
 from ifo_grounding.data.demonstrations import Demonstrations
-from ifo_grounding.data.pictures import check_colours, rgb
+from ifo_grounding.data.pictures import rgb, written_sentences
 from ifo_grounding.errors import UserError, extra
-from ifo_grounding.tasks.vocabulary import Vocabulary
 
 if TYPE_CHECKING:
     import datasets
@@ -32,10 +31,8 @@ def from_huggingface(
     *,
     frames: str = FRAMES,
     instruction: str = INSTRUCTION,
-    vocabulary: Vocabulary | None = None,
-    tile_size: int | None = None,
-    close: bool = True,
     progress: bool = False,
+    **options: Any,
 ) -> Demonstrations:
     """Read a dataset with one row per episode, row by row.
 
@@ -47,10 +44,9 @@ def from_huggingface(
             one array, uint8 [T + 1, C, H, W], such as a column ``Array4D``.
         frames: name of the column of frames.
         instruction: name of the column of instructions.
-        vocabulary: the words of the instructions; by default those that occur.
-        tile_size: of the codec; the cheapest one by default.
-        close: whether to repeat the last frame of episodes that do not show their stop.
         progress: whether to show a bar.
+        options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
+            ``tile_size``, ``close``.
 
     Raises:
         UserError: where a column is missing, or an episode is not as it has to be, with the number
@@ -60,13 +56,13 @@ def from_huggingface(
     >>> from_huggingface([{"frames": shown, "instruction": "go on"}]).lengths
     tensor([3])
     """
+    if isinstance(dataset, str):
+        raise UserError(
+            f"{dataset!r} is a string: give the dataset itself, such as "
+            "datasets.load_dataset(...) or datasets.load_from_disk(...) returns"
+        )
     rows = tqdm(_selected(dataset, frames, instruction), desc="read", disable=not progress)
-    return Demonstrations.from_episodes(
-        _episodes(rows, frames, instruction),
-        vocabulary=vocabulary,
-        tile_size=tile_size,
-        close=close,
-    )
+    return Demonstrations.from_episodes(_episodes(rows, frames, instruction), **options)
 
 
 def _selected(dataset: Any, frames: str, instruction: str) -> Iterable[Mapping[str, Any]]:
@@ -102,33 +98,25 @@ def _as_bytes(shown: Any) -> Any:
 def _episodes(
     rows: Iterable[Mapping[str, Any]], frames: str, instruction: str
 ) -> Iterator[Episode]:
-    for number, row in _numbered(rows):
-        if missing := {frames, instruction} - set(row):
-            raise UserError(f"episode {number} has no {' and no '.join(sorted(missing))}")
-        shown = row[frames]
-        if shown is None:
-            raise UserError(f"episode {number} has no frames (found None)")
-        if isinstance(shown, Image.Image | Mapping):
-            raise UserError(
-                f"episode {number} is a single picture, but a row is one episode: group the rows "
-                "of an episode, so that its frames are a list of pictures"
-            )
-        if isinstance(shown, Sequence) and any(map(_is_picture, shown)):
-            shown = stack_pictures(number, _pictures(number, shown))
-        yield number, shown, row[instruction]
-
-
-def _numbered(rows: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, Mapping[str, Any]]]:
-    """Number rows, and name one whose pictures ``datasets`` cannot decode."""
     rest = iter(rows)
     for number in itertools.count():
         try:
             row = next(rest)
         except StopIteration:
             return
-        except (OSError, SyntaxError, ValueError) as error:
+        except (OSError, SyntaxError, ValueError) as error:  # datasets cannot decode a picture
             raise UserError(f"episode {number} cannot be read ({error})") from None
-        yield number, row
+        if missing := {frames, instruction} - set(row):
+            raise UserError(f"episode {number} has no {' and no '.join(sorted(missing))}")
+        shown = row[frames]
+        if isinstance(shown, Image.Image | Mapping):
+            raise UserError(
+                f"episode {number} is a single picture, but a row is one episode: group the rows "
+                "of an episode, so that its frames are a list of pictures"
+            )
+        if isinstance(shown, Sequence) and any(map(_is_picture, shown)):
+            shown = stack_images(number, _images(number, shown))
+        yield number, shown, row[instruction]
 
 
 def _is_picture(one: Any) -> bool:
@@ -136,7 +124,7 @@ def _is_picture(one: Any) -> bool:
     return one is None or isinstance(one, Image.Image | Mapping)
 
 
-def _pictures(number: int, shown: Iterable[Any]) -> Iterator[tuple[str, Image.Image]]:
+def _images(number: int, shown: Iterable[Any]) -> Iterator[tuple[str, Image.Image]]:
     for step, picture in enumerate(shown):
         if isinstance(picture, Mapping):
             content: Any = picture.get("bytes")
@@ -144,8 +132,8 @@ def _pictures(number: int, shown: Iterable[Any]) -> Iterator[tuple[str, Image.Im
             if content is None and path is None:
                 raise UserError(f"episode {number}: frame {step} has neither bytes nor a path")
             try:
-                picture = Image.open(path if content is None else BytesIO(content))
-            except (OSError, SyntaxError, TypeError) as error:
+                picture = open_image(Path(path) if content is None else content)
+            except BROKEN as error:
                 raise UserError(
                     f"episode {number}: frame {step} cannot be read ({error})"
                 ) from None
@@ -172,9 +160,7 @@ def to_huggingface(
     """
     with extra("datasets", "this needs datasets"):
         import datasets
-    refuse_empty(len(demos))
-    sentences = demos.sentences()
-    check_colours(demos)
+    sentences = written_sentences(demos)
 
     def rows() -> Iterator[dict[str, Any]]:
         for number, sentence in enumerate(sentences):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
@@ -17,12 +18,11 @@ from ifo_grounding import keys
 from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.data.buffers import FINAL, frame_buffer
 from ifo_grounding.data.demonstrations import Demonstrations
-from ifo_grounding.data.folder import fact, load_folder, save_folder
+from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.modules import device_of, evaluating
 
 KIND = "ifo-grounding labels"
-VERSION = 1
 RELEASE_EVERY = 16
 """Batches after which freed memory is given back: theirs differ in size and would pile up."""
 QUANTILES = {"min": 0.0, "p01": 0.01, "p10": 0.1, "median": 0.5}
@@ -57,11 +57,11 @@ class LabelReport:
             values = self.confidence[self.actions == action].double().numpy()
             row: dict[str, float] = {"action": action, "count": count}
             if count:
-                row["mean"] = float(values.mean())
-                levels = torch.tensor(list(QUANTILES.values()), dtype=torch.float64)
-                ranks = (levels * (count - 1)).floor().long()
-                ordered = torch.from_numpy(values).sort().values[ranks]
-                row.update(zip(QUANTILES, ordered.tolist(), strict=True))
+                found = np.quantile(values, list(QUANTILES.values()), method="lower")
+                row |= {
+                    "mean": float(values.mean()),
+                    **dict(zip(QUANTILES, found.tolist(), strict=True)),
+                }
             rows.append(row)
         return rows
 
@@ -76,21 +76,21 @@ class LabelReport:
     def save(self, folder: str | Path) -> None:
         """Write a folder; :func:`labelled_buffer` makes the buffer again from it."""
         arrays = {"actions": self.actions, "confidence": self.confidence}
-        save_folder(folder, KIND, VERSION, arrays, {"n_actions": self.n_actions})
+        save_folder(folder, KIND, arrays, {"n_actions": self.n_actions})
 
     @classmethod
     def load(cls, folder: str | Path) -> LabelReport:
         """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`."""
-        arrays, facts = load_folder(folder, KIND, VERSION, ("actions", "confidence"))
-        n_actions = fact(facts, "n_actions", int)
-        actions, confidence = arrays["actions"], arrays["confidence"]
-        if actions.is_floating_point() or not confidence.is_floating_point():
-            raise UserError(f"{folder} is damaged: actions are whole numbers, confidences are not")
-        if actions.shape != confidence.shape or actions.ndim != 1:
-            raise UserError(f"{folder} is damaged: actions and confidence are not of one length")
-        if len(actions) and not 0 <= int(actions.min()) <= int(actions.max()) < n_actions:
-            raise UserError(f"{folder} is damaged: it holds an action outside 0..{n_actions - 1}")
-        return cls(actions, confidence, n_actions)
+        arrays, facts = load_folder(folder, KIND, ("actions", "confidence"))
+        with damaged(folder):
+            report = cls(arrays["actions"], arrays["confidence"], facts["n_actions"])
+            if report.actions.is_floating_point() or not report.confidence.is_floating_point():
+                raise UserError("actions are whole numbers, confidences are not")
+            if report.actions.shape != report.confidence.shape:
+                raise UserError("actions and confidence are not of one length")
+            if len(report.counts) != report.n_actions:
+                raise UserError(f"it holds an action outside 0..{report.n_actions - 1}")
+            return report
 
 
 class Labelled(NamedTuple):
@@ -109,7 +109,6 @@ def label_demonstrations(
     batch_size: int = 1024,
     device: torch.device | str | None = None,
     progress: bool = True,
-    logits_key: NestedKey = keys.LOGITS,
     **buffer_options: Any,
 ) -> Labelled:
     """Label every transition of demonstrations with an inverse model (paper, "Labelling").
@@ -121,11 +120,10 @@ def label_demonstrations(
     Args:
         demos: demonstrations.
         inverse: reads ``pixels`` and ``("next", "pixels")``, or two images of other names: the one
-            below ``next``, else the second, is the later one. Writes logits [B, A].
+            below ``next``, else the second, is the later one. Logits [B, A] are its first output.
         batch_size: transitions at once.
         device: where to run; by default where the model is.
         progress: whether to show a bar.
-        logits_key: where the model writes.
         buffer_options: for :func:`labelled_buffer`.
 
     Returns:
@@ -142,7 +140,7 @@ def label_demonstrations(
     labels, sure, n_actions = [], [], 0
     with evaluating(inverse), tqdm(total=len(frame), desc="label", disable=not progress) as bar:
         for count, numbers in enumerate(frame.split(batch_size), 1):
-            logits = _logits(demos, inverse, numbers, device, logits_key)
+            logits = _logits(demos, inverse, numbers, device)
             n_actions = logits.shape[-1]
             best = logits.float().softmax(-1).max(-1)
             if not best.values.isfinite().all():
@@ -162,7 +160,6 @@ def labelled_buffer(
     *,
     next_pixels: bool = False,
     initial_pixels: bool = False,
-    generator: torch.Generator | None = None,
     **options: Any,
 ) -> TensorDictReplayBuffer:
     """Put demonstrations and labels into a replay buffer, which shares the demonstrations' frames.
@@ -176,8 +173,7 @@ def labelled_buffer(
         actions: label of each transition, integer [M].
         next_pixels: whether samples also hold ``("next", "pixels")``.
         initial_pixels: whether samples also hold ``initial_pixels``, the episode's first frame.
-        generator: of the sampler.
-        options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``sampler``.
+        options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``generator``.
 
     Raises:
         UserError: where there is not one label for each transition, or one is no action's number.
@@ -211,36 +207,28 @@ def labelled_buffer(
     if initial_pixels:
         stored[keys.INITIAL_PIXELS] = demos.starts[episode]
         frame_keys.append(keys.INITIAL_PIXELS)
-    return frame_buffer(demos, stored, frame_keys, generator=generator, **options)
+    return frame_buffer(demos, stored, frame_keys, **options)
 
 
 def _logits(
-    demos: Demonstrations,
-    inverse: TensorDictModuleBase,
-    frame: Tensor,
-    device: torch.device,
-    logits_key: NestedKey,
+    demos: Demonstrations, inverse: TensorDictModuleBase, frame: Tensor, device: torch.device
 ) -> Tensor:
-    reads_tiles = getattr(getattr(inverse, "module", None), "reads_tiles", None)
-    present, later, in_order = _image_keys(inverse)
-    if in_order and reads_tiles is not None and reads_tiles(demos.image_shape, demos.tile_size):
-        parts = (demos.codec.tiles, demos.codes[frame], demos.codes[frame + 1])
-        return inverse.module.from_tiles(*(cast(Tensor, part).to(device) for part in parts))
-    pair = TensorDict({}, [len(frame)])
-    pair[present], pair[later] = (demos.frames(each).to(device) for each in (frame, frame + 1))
-    logits = inverse(pair).get(logits_key, None)
-    if logits is None or logits.ndim != 2 or len(logits) != len(frame):
-        found = "nothing" if logits is None else list(logits.shape)
-        raise UserError(f"the inverse model wrote {found} at {logits_key!r}, not logits [B, A]")
-    return logits
-
-
-def _image_keys(inverse: TensorDictModuleBase) -> tuple[NestedKey, NestedKey, bool]:
-    """Return under which keys a model reads a frame and the next one, and if in this order."""
+    """Return the logits [B, A] of transitions that begin with some frames, int64 [B]."""
     read = [unravel_key(key) for key in getattr(inverse, "in_keys", ())]
     if len(read) != 2:
-        return keys.PIXELS, (keys.NEXT, keys.PIXELS), True
+        read = [keys.PIXELS, (keys.NEXT, keys.PIXELS)]
     later = [isinstance(key, tuple) and key[0] == keys.NEXT for key in read]
-    swapped = later == [True, False]
-    present, following = reversed(read) if swapped else read
-    return present, following, not swapped
+    numbers = [frame + 1, frame] if later == [True, False] else [frame, frame + 1]
+    reads_tiles = getattr(getattr(inverse, "module", None), "reads_tiles", None)
+    if reads_tiles is not None and reads_tiles(demos.image_shape, demos.tile_size):
+        parts = (demos.codec.tiles, *(demos.codes[each] for each in numbers))
+        return inverse.module.from_tiles(*(cast(Tensor, part).to(device) for part in parts))
+    pair = TensorDict({}, [len(frame)])
+    for key, each in zip(read, numbers, strict=True):
+        pair[key] = demos.frames(each).to(device)
+    key = next(iter(getattr(inverse, "out_keys", ())), keys.LOGITS)
+    logits = inverse(pair).get(key, None)
+    if logits is None or logits.ndim != 2 or len(logits) != len(frame):
+        found = "nothing" if logits is None else list(logits.shape)
+        raise UserError(f"the inverse model wrote {found} at {key!r}, not logits [B, A]")
+    return logits

@@ -7,36 +7,36 @@ import functools
 import shutil
 import warnings
 from collections.abc import Callable, Iterator
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
-from PIL import Image
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import refuse_empty
-from ifo_grounding.data._reading import LAST, Episode
+from ifo_grounding.data._episodes import Episode
+from ifo_grounding.data._images import MODES, open_image
 from ifo_grounding.data.demonstrations import Demonstrations
-from ifo_grounding.data.pictures import check_colours, rgb
+from ifo_grounding.data.pictures import rgb, written_sentences
 from ifo_grounding.errors import UserError, extra
-from ifo_grounding.files import atomic_write
-from ifo_grounding.tasks.vocabulary import Vocabulary
+from ifo_grounding.files import atomic_write, regular_file
 
 if TYPE_CHECKING:
     from minari import MinariDataset
     from minari.data_collector import EpisodeBuffer
 
 IMAGE, INSTRUCTION = "image", "mission"
+OBSERVED = "observations"
+ENDS, CUT = ("truncations", "terminations"), [True, False]
+"""Names of what says how an episode ended, and what they say of one that was cut."""
 ABSENT = "actions_absent"
 DESCRIPTION = (
     "Observation-only demonstrations: actions and rewards are absent. The format demands them, so "
     "both are 0 throughout and mean nothing."
 )
 
-Read = Callable[[int, str | None], Any]
-"""Returns one observation of an episode, by its name, as it is stored: [T + 1, ...]."""
+Read = Callable[[int, str, str | None], Any]
+"""Returns what an episode holds below a name, such as its observations, or one part of it."""
 
 
 def from_minari(
@@ -44,25 +44,23 @@ def from_minari(
     *,
     image: str | None = IMAGE,
     instruction: str = INSTRUCTION,
-    vocabulary: Vocabulary | None = None,
-    tile_size: int | None = None,
-    close: bool = True,
     progress: bool = False,
+    **options: Any,
 ) -> Demonstrations:
     """Read the images and instructions of a Minari dataset, episode by episode.
 
     Its actions and rewards are never read, not even from disk: a dataset that has them gives the
-    same demonstrations as one that has none.
+    same demonstrations as one that has none. An episode that was truncated, and not terminated,
+    stays open: its last frame is no stop.
 
     Args:
         dataset: a dataset or a part of one, or the id of one on this machine.
         image: name of the image in the observation; None where the observation is the image.
         instruction: name of the sentence in the observation, where it is the same throughout an
             episode, or else in the metadata of the episode or of the dataset.
-        vocabulary: the words of the instructions; by default those that occur.
-        tile_size: of the codec; the cheapest one by default.
-        close: whether to repeat the last frame of episodes that do not show their stop.
         progress: whether to show a bar.
+        options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
+            ``tile_size``, ``close``.
 
     Raises:
         UserError: where Minari or the dataset is missing, the names are not those of the dataset,
@@ -75,12 +73,8 @@ def from_minari(
         except FileNotFoundError as error:
             raise UserError(str(error)) from None
     with _opened(dataset) as read:
-        return Demonstrations.from_episodes(
-            _episodes(dataset, read, image, instruction, progress),
-            vocabulary=vocabulary,
-            tile_size=tile_size,
-            close=close,
-        )
+        episodes = _episodes(dataset, read, image, instruction, progress)
+        return Demonstrations.from_episodes(episodes, **options)
 
 
 def _episodes(
@@ -97,9 +91,10 @@ def _episodes(
         )
     for number in tqdm(dataset.episode_indices.tolist(), desc="read", disable=not progress):
         try:
-            frames = _decoded(read(number, image), shown, storage.jpeg_encoding)
+            frames = _decoded(read(number, OBSERVED, image), shown, storage.jpeg_encoding)
+            ends = [bool(np.any(read(number, name, None))) for name in ENDS]
             if instruction in known:
-                said = {_text(text) for text in read(number, instruction)}
+                said = {_text(text) for text in read(number, OBSERVED, instruction)}
             else:
                 facts = common | next(iter(storage.get_episode_metadata([number])))
                 said = {_text(facts[instruction])} if instruction in facts else set()
@@ -114,7 +109,7 @@ def _episodes(
             raise UserError(
                 f"episode {number} has {len(said)} instructions: a demonstration follows one"
             )
-        yield number, frames, said.pop()
+        yield number, frames, said.pop(), ends == CUT
 
 
 def _text(value: Any) -> str:
@@ -129,12 +124,12 @@ def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
     from minari.dataset.minari_storage import is_image_space
 
     if jpeg and is_image_space(space):
-        frames = np.stack([np.asarray(Image.open(BytesIO(bytes(row)))) for row in rows])
+        frames = np.stack([np.asarray(open_image(bytes(row))) for row in rows])
     else:
         frames = np.stack(rows).reshape(-1, *space.shape)
     if frames.ndim == 3:
         return frames[:, None]
-    if frames.ndim == 4 and frames.shape[-1] in LAST and frames.shape[1] not in LAST:
+    if frames.ndim == 4 and frames.shape[-1] in MODES and frames.shape[1] not in MODES:
         return frames.transpose(0, 3, 1, 2)
     return frames
 
@@ -149,25 +144,38 @@ def _opened(dataset: MinariDataset) -> Iterator[Read]:
     import h5py
 
     try:
-        file = h5py.File(folder / "main_data.hdf5", "r")
+        file = h5py.File(regular_file(folder / "main_data.hdf5"), "r")
     except OSError as error:
         raise UserError(f"{folder} cannot be read ({error})") from None
     with file:
         yield functools.partial(_read_group, file)
 
 
-def _read_group(file: Any, number: int, name: str | None) -> Any:
-    observations = file[f"episode_{number}/observations"]
-    return (observations if name is None else observations[name])[()]
+def _read_group(file: Any, number: int, name: str, part: str | None) -> Any:
+    """Return an array that lies in this very file: links and storage in others are refused."""
+    import h5py
+
+    found = file
+    for step in filter(None, (f"episode_{number}", name, part)):
+        if name in ENDS and step not in found:
+            return ()  # nobody says how the episode ended
+        if not isinstance(found.get(step, getlink=True), h5py.HardLink | None):
+            raise OSError(f"{step!r} is a link")
+        found = found[step]
+    if found.external or found.is_virtual:
+        raise OSError(f"{found.name!r} lies in another file")
+    return found[()]
 
 
-def _read_table(folder: Path, kind: str, number: int, name: str | None) -> Any:
+def _read_table(folder: Path, kind: str, number: int, name: str, part: str | None) -> Any:
     from pyarrow import dataset
 
-    column = dataset.field("observations", *([] if name is None else [name]))
+    column = dataset.field(name, *([] if part is None else [part]))
     table = dataset.dataset(
         folder / str(number), format=kind, ignore_prefixes=["_", ".", "metadata.json"]
     )
+    if name not in table.schema.names and name in ENDS:
+        return ()
     return table.to_table(columns={"rows": column})["rows"].to_numpy()
 
 
@@ -193,9 +201,7 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
     from minari.dataset.minari_storage import MinariStorage
     from minari.storage.datasets_root_dir import get_dataset_path
 
-    refuse_empty(len(demos))
-    sentences = demos.sentences()
-    check_colours(demos)
+    sentences = written_sentences(demos)
     try:
         parse_dataset_id(dataset_id)
     except (ValueError, TypeError):  # the latter where the version is missing

@@ -7,48 +7,37 @@ import re
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import refuse_empty
-from ifo_grounding.data._gif import animation_frames, save_gif
-from ifo_grounding.data._reading import BROKEN, COLOURS, LAST, MODES, naming, stack_pictures
+from ifo_grounding.data._episodes import naming
+from ifo_grounding.data._images import (
+    BROKEN,
+    MODES,
+    SUFFIXES,
+    animation_frames,
+    open_image,
+    save_gif,
+    stack_images,
+)
 from ifo_grounding.data._video import read_video, write_video
+from ifo_grounding.data.buffers import refuse_empty
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.listing import LIST, VIDEOS, Listed, read_list
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.files import atomic_write
-from ifo_grounding.tasks.vocabulary import Vocabulary
 
-FORMATS = ("png", "gif", "mp4")
-FILES = {
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".jpe",
-    ".jfif",
-    ".bmp",
-    ".webp",
-    ".tif",
-    ".tiff",
-    ".ppm",
-    ".pgm",
-    ".tga",
-}
+KINDS = ("png", "gif", "mp4")
+COLOURS = (1, 3)
 MILLISECONDS = 250
 
 
 def load_pictures(
-    folder: str | Path,
-    *,
-    vocabulary: Vocabulary | None = None,
-    tile_size: int | None = None,
-    channels: int = 3,
-    close: bool = True,
-    progress: bool = False,
+    folder: str | Path, *, channels: int = 3, progress: bool = False, **options: Any
 ) -> Demonstrations:
     """Read demonstrations that were recorded as pictures.
 
@@ -56,7 +45,8 @@ def load_pictures(
     ``{"episode": "0001", "instruction": "go to the red ball"}``, and for each of them a folder of
     that name with its frames, in the order of their names (``2.png`` before ``10.png``), an
     animated picture of that name (``0001.gif``) or a video (``0001.mp4``, with the extra
-    ``video``). A line may name another path as ``"frames"``.
+    ``video``). A line may name another path as ``"frames"``, and say ``"truncated": true`` of a
+    recording that was cut, whose last frame is no stop.
 
     Frames that are numbered have to be numbered evenly: a missing one is an error. A GIF of
     :func:`save_pictures` comes back with every frame. Of other GIFs, each picture is one frame
@@ -68,11 +58,10 @@ def load_pictures(
 
     Args:
         folder: where from.
-        vocabulary: the words of the instructions; by default those that occur.
-        tile_size: of the codec; the cheapest one by default.
         channels: 1 reads pictures as grey, 3 in colours, 4 with alpha.
-        close: whether to repeat the last frame of episodes that do not show their stop.
         progress: whether to show a bar.
+        options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
+            ``tile_size``, ``close``.
 
     Raises:
         UserError: naming the episode, where a line, a frame or an instruction is not as it has to
@@ -80,49 +69,54 @@ def load_pictures(
     """
     check_choice("channels", channels, MODES)
     shown = (
-        (one.name, stack_pictures(one.name, _pictures(one), channels), one.instruction)
+        (one.name, stack_images(one.name, _images(one), channels), one.instruction, one.cut)
         for one in tqdm(read_list(Path(folder)), desc="read", disable=not progress)
     )
-    return Demonstrations.from_episodes(
-        shown, vocabulary=vocabulary, tile_size=tile_size, close=close
-    )
+    return Demonstrations.from_episodes(shown, **options)
 
 
-def _pictures(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
-    """Yield name and picture of each frame."""
-    if episode.path.is_dir():
-        found = (path for path in episode.path.iterdir() if path.suffix.lower() in FILES)
-        paths = sorted(found, key=_natural)
-        if not paths:
-            raise UserError(
-                f"episode {episode.name!r} has no frames: {episode.path} holds none of "
-                + ", ".join(sorted(FILES))
-            )
-        _check_numbers(episode.name, paths)
-    elif episode.path.suffix.lower() in VIDEOS:
+def _images(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
+    """Yield name and image of each frame."""
+    path = episode.path
+    if path.suffix.lower() in VIDEOS and not path.is_dir():
         with naming(episode.name):
-            for number, frame in enumerate(read_video(episode.path)):
-                yield f"{episode.path.name}, frame {number}", frame
+            for number, frame in enumerate(read_video(path)):
+                yield f"{path.name}, frame {number}", frame
         return
-    else:
-        paths = [episode.path]
-    for path in paths:
-        try:
-            with Image.open(path) as opened:
-                if episode.path.is_dir():
+    try:
+        if path.is_dir():
+            for path in _frame_files(episode):
+                with open_image(path) as opened:
                     _check_single(episode.name, path, opened)
                     yield path.name, opened
-                    continue
-                for number, frame in animation_frames(path, opened):
-                    yield f"{path.name}, frame {number}", frame
-        except BROKEN as error:
-            raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
+            return
+        for number, frame in animation_frames(path):
+            yield f"{path.name}, frame {number}", frame
+    except UserError:
+        raise
+    except BROKEN as error:
+        raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
 
 
-def _check_single(name: str, path: Path, picture: Image.Image) -> None:
+def _frame_files(episode: Listed) -> list[Path]:
+    """Return the files of a folder that are its frames, in order."""
+    found = list(episode.path.iterdir())
+    paths = sorted((path for path in found if path.suffix.lower() in SUFFIXES), key=_natural)
+    if not paths:
+        others = sorted({path.suffix for path in found if path.suffix})
+        raise UserError(
+            f"episode {episode.name!r} has no frames: {episode.path} holds none of "
+            + ", ".join(SUFFIXES)
+            + (f", but {', '.join(others)}" if others else "")
+        )
+    _check_numbers(episode.name, paths)
+    return paths
+
+
+def _check_single(name: str, path: Path, image: Image.Image) -> None:
     """Refuse an animation where a frame should be. A photo may hold others, such as a preview."""
-    count = getattr(picture, "n_frames", 1)
-    if count > 1 and picture.format != "MPO":
+    count = getattr(image, "n_frames", 1)
+    if count > 1 and image.format != "MPO":
         raise UserError(
             f"episode {name!r}: {path.name} holds {count} pictures, and each file of a folder is "
             "one frame: save them one by one, or name the file itself as the frames"
@@ -178,18 +172,14 @@ def save_pictures(
         UserError: where the folder holds something, there is no demonstration or no vocabulary, the
             kind is unknown, or images do not fit it.
     """
-    check_choice("kind", kind, FORMATS)
+    check_choice("kind", kind, KINDS)
     scale = at_least_one("scale", scale)
-    refuse_empty(len(demos))
+    sentences = written_sentences(demos, tuple(MODES) if kind == "png" else COLOURS)
     folder = Path(folder)
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise UserError(
             f"{folder} exists and is no empty folder: name another one, or remove it first"
         )
-    sentences = demos.sentences()
-    if "" in sentences:
-        raise UserError(f"demonstration {sentences.index('')} has no instruction: leave it out")
-    check_colours(demos, LAST if kind == "png" else COLOURS)
     digits = len(str(len(demos) - 1))
     with atomic_write(folder) as temporary:
         temporary.mkdir()
@@ -198,27 +188,40 @@ def save_pictures(
             name = f"{number:0{digits}d}"
             lines.append(json.dumps({"episode": name, "instruction": sentence}))
             frames = rgb(demos[number]["pixels"]).repeat(scale, 1).repeat(scale, 2)
-            if kind == "mp4":
-                write_video(temporary / f"{name}.mp4", frames, fps=1000 / MILLISECONDS)
-                continue
-            pictures = [Image.fromarray(frame) for frame in frames]
-            if kind == "gif":
-                save_gif(temporary / f"{name}.gif", pictures, MILLISECONDS)
-                continue
-            (temporary / name).mkdir()
-            for step, picture in enumerate(pictures):
-                picture.save(temporary / name / f"{step:04d}.png")
+            _save_episode(temporary / name, frames, kind)
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def check_colours(demos: Demonstrations, allowed: tuple[int, ...] = COLOURS) -> None:
-    """Refuse frames that are no pictures."""
-    if demos.image_shape[0] not in allowed:
-        *others, last = allowed
+def _save_episode(path: Path, frames: np.ndarray, kind: str) -> None:
+    if kind == "mp4":
+        write_video(path.with_suffix(".mp4"), frames, fps=1000 / MILLISECONDS)
+        return
+    images = [Image.fromarray(frame) for frame in frames]
+    if kind == "gif":
+        save_gif(path.with_suffix(".gif"), images, MILLISECONDS)
+        return
+    path.mkdir()
+    for step, image in enumerate(images):
+        image.save(path / f"{step:04d}.png")
+
+
+def written_sentences(demos: Demonstrations, colours: tuple[int, ...] = COLOURS) -> list[str]:
+    """Return the instructions of demonstrations that can be written as pictures.
+
+    Raises:
+        UserError: where there is none, or one has no instruction, or frames are no pictures.
+    """
+    refuse_empty(len(demos))
+    sentences = demos.sentences()
+    if "" in sentences:
+        raise UserError(f"demonstration {sentences.index('')} has no instruction: leave it out")
+    if demos.image_shape[0] not in colours:
+        *others, last = colours
         raise UserError(
             f"pictures have {', '.join(map(str, others))} or {last} colours, these frames have "
             f"{demos.image_shape[0]}"
         )
+    return sentences
 
 
 def rgb(pixels: Tensor) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,20 +12,20 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import Categorical, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import Categorical, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
+from ifo_grounding.data.buffers import encoded_buffer
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
-from ifo_grounding.data.folder import DAMAGED, fact, load_folder, save_folder
-from ifo_grounding.errors import UserError, at_least_one, whole
+from ifo_grounding.data.folder import damaged, load_folder, save_folder
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
-VERSION = 1
 BATCH_FRAMES = 2048
 READ_KEYS = (keys.PIXELS, keys.ACTION, (keys.NEXT, keys.PIXELS))
 
@@ -123,7 +123,7 @@ class Collected(NamedTuple):
         }
         if codec.tiles is not None:
             arrays["tiles"] = codec.tiles
-        save_folder(folder, KIND, VERSION, arrays, {"image_shape": list(codec.image_shape)})
+        save_folder(folder, KIND, arrays, {"image_shape": list(codec.image_shape)})
 
     @classmethod
     def load(cls, folder: str | Path, **options: Any) -> Collected:
@@ -135,47 +135,23 @@ class Collected(NamedTuple):
                 ``transform`` comes after frames are decoded.
         """
         names = ("pixels", "next_pixels", "action", "taken", "kept")
-        arrays, facts = load_folder(folder, KIND, VERSION, names, ("tiles",))
-        codes, after, action = (arrays[name] for name in names[:3])
-        try:
-            codec = FrameCodec(fact(facts, "image_shape", list), arrays.get("tiles"))
-        except DAMAGED as error:
-            raise UserError(f"{folder} is damaged: {error}") from None
-        if any(
-            part.ndim != 1 or part.is_floating_point()
-            for part in (arrays[name] for name in names[2:])
-        ):
-            raise UserError(f"{folder} is damaged: its actions are no rows of whole numbers")
-        count = len(codec.tiles) if codec.tiles is not None else 256
-        for part in (codes, after):
-            if part.shape != (len(action), *codec.code_shape) or part.is_floating_point():
-                raise UserError(f"{folder} is damaged: its arrays do not fit each other")
-            if part.numel() and not 0 <= int(part.min()) <= int(part.max()) < count:
-                raise UserError(f"{folder} is damaged: it holds a tile outside its dictionary")
-        if not len(action) or not 0 <= int(action.min()) <= int(action.max()) < len(
-            arrays["taken"]
-        ):
-            raise UserError(f"{folder} is damaged: it holds no actions, or unknown ones")
-        report = TransitionReport(arrays["taken"], arrays["kept"])
-        return cls(_buffer(codec, codes, action, after, options), report)
+        arrays, facts = load_folder(folder, KIND, names, ("tiles",))
+        codes, after, action, taken, kept = (arrays[name] for name in names)
+        with damaged(folder):
+            codec = FrameCodec(facts["image_shape"], arrays.get("tiles"))
+            codec.check(codes)
+            codec.check(after)
+            if not len(action) or len(action.bincount(minlength=len(taken))) > len(taken):
+                raise UserError("it holds no actions, or unknown ones")
+            report = TransitionReport(taken, kept)
+            return cls(_buffer(codec, codes, action, after, options), report)
 
 
 def _buffer(
     codec: FrameCodec, codes: Tensor, action: Tensor, after: Tensor, options: dict[str, Any]
 ) -> TensorDictReplayBuffer:
-    if "storage" in options:
-        raise UserError(
-            "the storage is the buffer's own, which holds frames as codes: leave storage out"
-        )
-    further = options.pop("transform", None)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(action)), **options)
     entries = {keys.PIXELS: codes, keys.ACTION: action, keys.NEXT: {keys.PIXELS: after}}
-    buffer.extend(TensorDict(entries, [len(action)]))
-    # Appended last, for what was stored so far is encoded already.
-    buffer.append_transform(FrameDecoder(codec))
-    if further is not None:
-        buffer.append_transform(further)  # it sees what is sampled, decoded
-    return buffer
+    return encoded_buffer(TensorDict(entries, [len(action)]), [FrameDecoder(codec)], options)
 
 
 def collect_transitions(
@@ -229,44 +205,29 @@ def collect_transitions(
             "drop_unchanged=False"
         )
     policy = RandomActions(env, stop_probability, stop_action, seed)
-    harvest = _Harvest(policy.n_actions, policy.stop_action, drop_unchanged)
-    batches = _collect(env, policy, n, progress)
-    codec, codes = FrameCodec.compress(harvest.pieces(batches))
+    taken = torch.zeros(policy.n_actions, dtype=torch.int64)
+    actions: list[Tensor] = []
+
+    def pieces() -> Iterator[Tensor]:
+        """Yield frames and next frames in turns, uint8 [2 K, C, H, W], of the K kept steps."""
+        for batch in _collect(env, policy, n, progress):
+            action = batch[keys.ACTION].cpu()
+            pair = torch.stack([batch[keys.PIXELS], batch[keys.NEXT, keys.PIXELS]], 1).cpu()
+            taken.add_(action.bincount(minlength=len(taken)))
+            if drop_unchanged:
+                keep = (pair[:, 0] != pair[:, 1]).flatten(1).any(1)
+                if policy.stop_action is not None:
+                    keep |= action == policy.stop_action
+                action, pair = action[keep], pair[keep]
+            actions.append(action)
+            yield pair.flatten(0, 1)
+
+    codec, codes = FrameCodec.compress(pieces())
     if not len(codes):
         raise UserError(f"none of {n} steps changed anything or stopped: take more steps")
-    buffer = _buffer(codec, codes[0::2], torch.cat(harvest.actions), codes[1::2], options)
-    return Collected(buffer, TransitionReport(harvest.taken, harvest.kept))
-
-
-@dataclass
-class _Harvest:
-    """Takes frames and actions from collected batches, and counts."""
-
-    n_actions: int
-    stop_action: int | None
-    """The action whose unchanged transitions are kept."""
-    drop_unchanged: bool
-    """Whether those of all others are dropped."""
-    actions: list[Tensor] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.taken = torch.zeros(self.n_actions, dtype=torch.int64)
-        self.kept = torch.zeros(self.n_actions, dtype=torch.int64)
-
-    def pieces(self, batches: Iterator[TensorDictBase]) -> Iterator[Tensor]:
-        """Yield frames and next frames in turns, uint8 [2 K, C, H, W], of the K kept steps."""
-        for batch in batches:
-            action = batch[keys.ACTION].cpu()
-            pixels, after = batch[keys.PIXELS].cpu(), batch[keys.NEXT, keys.PIXELS].cpu()
-            self.taken += action.bincount(minlength=self.n_actions)
-            if self.drop_unchanged:
-                keep = (pixels != after).flatten(1).any(1)
-                if self.stop_action is not None:
-                    keep |= action == self.stop_action
-                action, pixels, after = action[keep], pixels[keep], after[keep]
-            self.kept += action.bincount(minlength=self.n_actions)
-            self.actions.append(action)
-            yield torch.stack([pixels, after], 1).flatten(0, 1)
+    kept = torch.cat(actions)
+    buffer = _buffer(codec, codes[0::2], kept, codes[1::2], options)
+    return Collected(buffer, TransitionReport(taken, kept.bincount(minlength=len(taken))))
 
 
 def _collect(

@@ -8,12 +8,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ifo_grounding.data.folder import load_folder, save_folder
+from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks.goals import Goal
 
 KIND = "ifo-grounding truth"
-VERSION = 1
 FIELDS = ("task", "object", "reference", "source", "target", "side")
 
 
@@ -37,19 +36,17 @@ class Truth:
         goals = {}
         if self.goals is not None:
             goals = {name: getattr(self.goals, name).to(torch.uint8) for name in FIELDS}
-        save_folder(folder, KIND, VERSION, {"actions": self.actions, **goals}, {})
+        save_folder(folder, KIND, {"actions": self.actions, **goals}, {})
 
     @classmethod
     def load(cls, folder: str | Path) -> Truth:
         """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`."""
-        arrays, _ = load_folder(folder, KIND, VERSION, ("actions",), FIELDS)
-        if any(array.is_floating_point() for array in arrays.values()):
-            raise UserError(f"{folder} is damaged: actions and goals are whole numbers")
-        actions = arrays.pop("actions")
-        if not arrays and actions.ndim == 1:
-            return cls(actions)
-        shapes = {tuple(array.shape) for array in arrays.values()}
-        if len(arrays) != len(FIELDS) or len(shapes) != 1 or actions.ndim != 1:
-            raise UserError(f"{folder} is damaged: its arrays do not fit each other")
-        goals = {name: array.long() for name, array in arrays.items()}
-        return cls(actions, Goal(**goals, batch_size=shapes.pop()))
+        arrays, _ = load_folder(folder, KIND, ("actions",), FIELDS)
+        with damaged(folder):
+            if any(each.ndim != 1 or each.is_floating_point() for each in arrays.values()):
+                raise UserError("actions and goals are rows of whole numbers")
+            actions = arrays.pop("actions")
+            if not arrays:
+                return cls(actions)
+            goals = {name: array.long() for name, array in arrays.items()}
+            return cls(actions, Goal(**goals, batch_size=[len(arrays["task"])]))

@@ -164,9 +164,8 @@ class Grammar:
     def parse(self, sentences: str | list[str]) -> Goal:
         """Return the goal of each sentence, [N].
 
-        Sentences that exchange words of this task's (:func:`~ifo_grounding.data.recombined`) are
-        read, too: other wordings, and what makes no sense, such as from a box into the same box,
-        whose goal suits no state.
+        Sentences that exchange words of this task's are read, too: other wordings, and what makes
+        no sense, such as from a box into the same box, whose goal suits no state.
 
         Raises:
             UserError: where a sentence is none of this task's.
