@@ -56,14 +56,15 @@ def examine(options: Options) -> dict:
     env = TransformedEnv(simulator, Compose(chosen_starts(run, options), reward))
     # What demonstrations add: an imitation loss beside the reward, and accuracy on those held out.
     seen, aside = labelled_demonstrations(run, options.imitate.held_out)
-    imitation = AuxiliaryImitation(ImitationLoss(policy), seen, section.imitation_weight)
+    weight = section.imitation_weight
+    imitation = AuxiliaryImitation(ImitationLoss(policy), seen, weight) if weight else None
     history = self_examine(
         env,
         policy,
         value,
         section,
         seed=options.seed,
-        imitation=imitation if section.imitation_weight else None,
+        imitation=imitation,
         held_out=held_out_accuracy(policy, aside, run, options),
         adversarial=adversarial_updates(reward, run, options),
         checkpoint=stage.checkpoint,

@@ -22,7 +22,7 @@ from ifo_grounding.data.buffers import encoded_buffer
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
-from ifo_grounding.errors import UserError, at_least_one
+from ifo_grounding.errors import UserError, at_least_one, whole
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
