@@ -1,4 +1,4 @@
-"""A gradient step that a GPU is told of once and then repeats: a CUDA graph."""
+"""Captures a gradient step as a CUDA graph, which a GPU repeats without waiting for Python."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from ifo_grounding.errors import UserError
 
 Update = Callable[[TensorDictBase], dict[str, Tensor]]
 WARM_UP = 3
-"""Steps that are made one kernel at a time, in which libraries settle how they compute."""
+"""Steps before the capture, kernel by kernel, in which libraries choose their algorithms."""
 
 
 class CapturedUpdate:
     """Makes the same update of batch after batch, from the fourth on as one CUDA graph.
 
-    A small network's step is hundreds of kernels of some microseconds, and a GPU waits for Python
-    to ask for each. ``tensordict.nn.CudaGraphModule`` does as much, but waits for the GPU at every
-    step, and takes tensordicts from PyTorch's trees for good.
+    A small network's step is hundreds of kernels of some microseconds each, and Python launches
+    them more slowly than a GPU computes them. ``tensordict.nn.CudaGraphModule`` captures a step
+    too, but synchronises with the GPU at every call.
 
     Args:
-        update: maps a batch to metrics; the same kernels whatever the batch holds, nothing read
-            back, and an optimizer that :func:`let_capture` was told of.
+        update: maps a batch to metrics. It launches the same kernels whatever the batch holds,
+            reads no tensor back to the CPU, and steps an optimizer prepared by
+            :func:`let_capture`.
 
-    A metric is overwritten by the next call.
+    The next call overwrites the metrics that a call returned.
 
     Raises:
         UserError: where the update cannot be captured.
@@ -71,7 +72,7 @@ class CapturedUpdate:
 
 
 def let_capture(optimizer: torch.optim.Optimizer, captured: bool) -> None:
-    """Let an optimizer be part of a CUDA graph, or of none, whatever a checkpoint says of it."""
+    """Prepare an optimizer for a CUDA graph, or for none, whatever a checkpoint has set."""
     for group in optimizer.param_groups:
         rate = float(group["lr"])
         group["lr"] = torch.tensor(rate, device=group["params"][0].device) if captured else rate

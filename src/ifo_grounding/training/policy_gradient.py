@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from ifo_grounding.training.self_examination import SelfExaminationConfig
 
 AT_ONCE = 2048
-"""Steps whose values are estimated together: as fast as all at once, in a fraction of the memory.
-"""
+"""Steps whose values are estimated together, to bound memory."""
 
 
 class Learner:

@@ -190,10 +190,12 @@ class Run:
                 run's.
         """
         taken = self / TAKEN
+        if (self / OPTIONS).exists():
+            return
         if not taken.exists():
-            if self.begun:
+            if self.begun:  # it has taken over all, and was killed before its options were written
                 return
-            if any(path for path in self.folder.glob("[!.]*")):
+            if any(self.folder.glob("[!.]*")):
                 raise UserError(f"{self.folder} holds other files and no run: name another run")
             if not (other / "stages").is_dir():
                 raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
