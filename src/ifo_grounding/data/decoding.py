@@ -62,7 +62,7 @@ class FrameDecoder(_Table):
     >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), transform=decoder)
     >>> indices = buffer.extend(TensorDict({"pixels": codes}, [10]))
     >>> buffer.storage.get(slice(None))["pixels"].shape, buffer.sample(4)["pixels"].shape
-    (torch.Size([10, 3, 3]), torch.Size([4, 3, 48, 48]))
+    (torch.Size([10, 6, 6]), torch.Size([4, 3, 48, 48]))
     """
 
     def __init__(
