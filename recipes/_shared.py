@@ -162,7 +162,7 @@ def decode_on(device: str, buffer: Any) -> None:
     if transform is None or torch.device(device).type == "cpu":
         return
     parts = [part for part in transform.modules() if isinstance(part, FrameDecoder)]
-    if all(part.words is not None for part in parts):
+    if all(part.table is not None for part in parts):
         transform.to(device)
 
 

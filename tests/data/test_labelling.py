@@ -143,15 +143,6 @@ def test_samples_are_the_demonstrations_own_transitions(inverse):
     assert torch.equal(buffer[sample["index"]]["instruction"], sample["instruction"])
 
 
-def test_a_selection_is_labelled_alone(inverse):
-    demos = record_demonstrations("move-udlr", 30)
-    chosen = demos[[7, 21]]
-    buffer, report = label_demonstrations(chosen, inverse, progress=False)
-    assert len(buffer) == len(report.actions) == chosen.transitions
-    assert torch.equal(buffer[0]["pixels"], demos[7]["pixels"][0])
-    assert buffer[:]["final"].sum() == 2
-
-
 def test_the_model_is_evaluated_and_left_as_it_was(inverse):
     demos = record_demonstrations("move", 5)
     inverse.train()

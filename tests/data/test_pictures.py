@@ -300,16 +300,6 @@ def test_what_is_there_is_not_replaced(kind, demos, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_nothing_half_written_stays_behind(demos, tmp_path, monkeypatch):
-    def fail(*args, **kwargs):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(Image.Image, "save", fail)
-    with pytest.raises(OSError, match="disk full"):
-        save_pictures(demos, tmp_path / "shown")
-    assert not list(tmp_path.iterdir())
-
-
 def film(path, frames=20, size=(32, 16), codec="libx264"):
     """Make a video of plain frames, four a second."""
     with av.open(path, "w") as video:

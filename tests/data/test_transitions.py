@@ -129,16 +129,6 @@ def test_a_transform_of_the_buffer_sees_images(tmp_path):
         collect_transitions(make_env(), 20, storage=LazyTensorStorage(20))
 
 
-def test_more_transitions_can_be_added():
-    env = make_env()
-    buffer, _ = collect_transitions(env, 300, stop_probability=0.02)
-    count = len(buffer)
-    more = buffer[:10].clone()
-    buffer.extend(more)
-    assert len(buffer) == count
-    assert torch.equal(buffer[:10]["pixels"], more["pixels"])
-
-
 def test_saved_transitions_are_the_same(tmp_path):
     collected = collect_transitions(make_env(), 400)
     collected.save(tmp_path / "t")

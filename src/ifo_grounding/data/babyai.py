@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from multiprocessing import get_context
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, Literal, overload
 
 import gymnasium
 import numpy as np
@@ -48,8 +48,8 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
         tile_size: pixels along one side of a cell.
         mission: what becomes of a room whose mission is fulfilled. It ``ends`` and pays, as BabyAI
             has it; it ``waits`` until the policy is done, and then pays, also where the policy has
-            undone the mission since; or there is ``none``, and the room goes on: a learner
-            practises what it chooses itself.
+            undone the mission since; or there is ``none``, and the room goes on, for a learner
+            that chooses its instructions itself.
 
     Raises:
         UserError: where minigrid is missing, or there is no such level.
@@ -118,15 +118,9 @@ class _Room(gymnasium.Wrapper):
         return cells.swapaxes(1, 2).reshape(grid.height * size, grid.width * size, 3)
 
 
-class _Played(NamedTuple):
-    """What the bot did in a room."""
-
-    frames: np.ndarray
-    """uint8 [T + 1, 3, H, W]; the last one is repeated."""
-    mission: str
-    """What it was asked for."""
-    actions: list[int]
-    """What it did, the stop included, [T]."""
+Played = tuple[np.ndarray, str, list[int]]
+"""What the bot did in a room: frames, uint8 [T + 1, 3, H, W], the last one repeated; the mission;
+and its actions, the stop included, [T]."""
 
 
 @overload
@@ -185,8 +179,9 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
         bar = tqdm(total=n, desc=f"record {level}", disable=not progress)
         with bar, _mapper(processes) as run:
             for played in filter(None, run(play, seeds)):
-                yield solved, played.frames, played.mission
-                actions.extend(played.actions)
+                frames, mission, taken = played
+                yield solved, frames, mission
+                actions.extend(taken)
                 solved += 1
                 bar.update()
                 if solved == n:
@@ -254,10 +249,8 @@ def _mapper(processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
     pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
 
     def run(play: Callable[[int], Any], seeds: Iterator[int]) -> Iterator[Any]:
-        waiting = [pool.submit(play, seed) for seed in itertools.islice(seeds, 16 * processes)]
-        while waiting:
-            yield waiting.pop(0).result()
-            waiting += [pool.submit(play, seed) for seed in itertools.islice(seeds, 1)]
+        while some := list(itertools.islice(seeds, 16 * processes)):
+            yield from pool.map(play, some)
 
     try:
         yield run
@@ -265,7 +258,7 @@ def _mapper(processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
         pool.shutdown(cancel_futures=True)
 
 
-def _play(make: Make, seed: int) -> _Played | None:
+def _play(make: Make, seed: int) -> Played | None:
     """Let the bot play a room; None where it does not succeed."""
     from minigrid.utils.baby_ai_bot import BabyAIBot
 
@@ -287,4 +280,4 @@ def _play(make: Make, seed: int) -> _Played | None:
         return None
     frames.append(frames[-1])  # the stop
     pictures = np.stack(frames).transpose(0, 3, 1, 2)
-    return _Played(pictures, str(observation["mission"]), [*actions, DONE])
+    return pictures, str(observation["mission"]), [*actions, DONE]

@@ -130,7 +130,7 @@ def encoded_buffer(
         )
     further = options.pop("transform", None)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(entries)), **options)
-    buffer.extend(entries)  # before the transforms come, which would encode it
+    buffer.extend(entries)
     for transform in transforms if further is None else [*transforms, further]:
         buffer.append_transform(transform)
     return buffer

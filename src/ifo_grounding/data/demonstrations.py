@@ -53,8 +53,8 @@ class Demonstrations:
     """
 
     __slots__ = (
-        *("codec", "codes", "lengths", "starts", "tokens"),
-        *("vocabulary", "vocabulary_size"),
+        *("codec", "codes", "lengths", "starts"),
+        *("tokens", "vocabulary", "vocabulary_size"),
     )
     lengths: Tensor
     """Frames of each episode, int64 [N]."""
@@ -81,9 +81,8 @@ class Demonstrations:
         vocabulary_size = whole("vocabulary_size", vocabulary_size)
         codec.check(codes)
         check_parts(len(codes), lengths, instructions, vocabulary_size)
-        self.codec, self.codes = codec, codes
+        self.codec, self.codes, self.lengths = codec, codes, lengths.long()
         self.vocabulary, self.vocabulary_size = vocabulary, vocabulary_size
-        self.lengths = lengths.long()
         self.starts = self.lengths.cumsum(0) - self.lengths
         small = torch.int16 if vocabulary_size <= torch.iinfo(torch.int16).max else torch.int32
         self.tokens = instructions.to(small)
@@ -112,9 +111,8 @@ class Demonstrations:
             UserError: with the number of the episode that is not as it has to be.
         """
         if not isinstance(instructions, Tensor):
-            named: Iterable[Any] = (
-                (number, *both) for number, both in enumerate(zip_longest(frames, instructions))
-            )
+            pairs: Iterable[Any] = enumerate(zip_longest(frames, instructions))
+            named = ((number, *pair) for number, pair in pairs)
             return cls.from_episodes(
                 named, vocabulary=vocabulary, length=length, tile_size=tile_size, close=False
             )
@@ -239,8 +237,7 @@ class Demonstrations:
             tokens = self.tokens[index].long().expand(length, -1)
             pixels = self.frames(torch.arange(first, first + length))
             return TensorDict({keys.PIXELS: pixels, keys.INSTRUCTION: tokens}, [length])
-        if isinstance(index, slice):
-            index = list(range(len(self))[index])
+        index = list(range(len(self))[index]) if isinstance(index, slice) else index
         index = torch.as_tensor(index).cpu()
         index = index if index.dtype == torch.bool else index.long()
         chosen = copy.copy(self)
@@ -303,10 +300,9 @@ class Demonstrations:
         arrays = {"codes": codes, "lengths": self.lengths, "instructions": self.tokens}
         if self.codec.tiles is not None:
             arrays["tiles"] = self.codec.tiles
-        words = None if self.vocabulary is None else list(self.vocabulary.words)
         facts = {
             "image_shape": list(self.image_shape),
-            "words": words,
+            "words": None if self.vocabulary is None else list(self.vocabulary.words),
             "vocabulary_size": self.vocabulary_size,
         }
         save_folder(folder, KIND, arrays, facts)

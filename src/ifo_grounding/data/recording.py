@@ -16,12 +16,11 @@ from ifo_grounding.data.truth import Truth
 from ifo_grounding.errors import at_least_one, check_choice
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
-from ifo_grounding.tasks.goals import MAX_STEPS
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import Scene, SceneOptions
 from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY
-from ifo_grounding.world import Layout, step
+from ifo_grounding.world import step
 from ifo_grounding.world.tiles import TILE_SIZES, tile_index, tile_table
 
 BATCH = 4096
@@ -35,20 +34,15 @@ def record_demonstrations(
 def record_demonstrations(
     task: str, n: int, *, keep_truth: Literal[True], **options: Any
 ) -> tuple[Demonstrations, Truth]: ...
-def record_demonstrations(  # type: ignore[misc]  # the overloads leave options open
+def record_demonstrations(
     task: str,
     n: int,
     *,
     keep_truth: bool = False,
     seed: int = 0,
-    split: str = "all",
-    holdout: str = "pairs-3",
-    holdout_visible: bool = True,
-    stream: str = "training",
-    layout: Layout | None = None,
-    max_steps: int = MAX_STEPS,
     tile_size: int = 8,
     progress: bool = False,
+    **scenes: Any,
 ) -> Demonstrations | tuple[Demonstrations, Truth]:
     """Record an expert that follows suitable instructions on shortest paths, and then stops.
 
@@ -59,14 +53,10 @@ def record_demonstrations(  # type: ignore[misc]  # the overloads leave options 
         n: number of demonstrations.
         keep_truth: whether to return actions and goals too, for evaluation only.
         seed: same seed, same demonstrations.
-        split: ``all``, ``train`` or ``zero-shot`` instructions.
-        holdout: named list of colour-shape pairs that the split ``train`` does not mention.
-        holdout_visible: whether these pairs are still seen in scenes of the split ``train``.
-        stream: ``training``, ``validation`` or ``evaluation`` scenes.
-        layout: grid size and numbers of things.
-        max_steps: actions per episode.
         tile_size: pixels along one side of a cell: 8, 16 or 32.
         progress: whether to show a bar.
+        scenes: for :class:`~ifo_grounding.tasks.scenes.SceneOptions`: ``split``, ``holdout``,
+            ``holdout_visible``, ``stream``, ``layout``, ``max_steps``.
 
     Returns:
         The demonstrations; with ``keep_truth`` also a :class:`~ifo_grounding.data.truth.Truth`.
@@ -80,29 +70,21 @@ def record_demonstrations(  # type: ignore[misc]  # the overloads leave options 
     """
     check_choice("tile size", tile_size, TILE_SIZES)
     n = at_least_one("the number of demonstrations", n)
-    options = SceneOptions(
-        task=task,
-        split=split,
-        holdout=holdout,
-        holdout_visible=holdout_visible,
-        stream=stream,
-        layout=layout or Layout(),
-        max_steps=max_steps,
-    )
+    options = SceneOptions(task=task, **scenes)
     # Every scene is asked for once, in order.
     drawn = SceneStream(options, derive(seed, "demonstrations"), kept=1)
     parts: list[Tensor] = []
     lengths, instructions, actions = [], [], []
     with _one_thread(), tqdm(total=n, desc="record", disable=not progress) as bar:
         for first in range(0, n, BATCH):
-            scenes = drawn.scenes(torch.arange(first, min(n, first + BATCH)))
+            batch = drawn.scenes(torch.arange(first, min(n, first + BATCH)))
             ties = generator(seed, "demonstrations", options.stream, "ties", first)
-            frames, taken = _demonstrate(scenes, ties)
+            frames, taken = _demonstrate(batch, ties)
             parts.append(frames)
             actions.append(taken)
-            lengths.append(scenes.wanted.steps + 1)
-            instructions.append(scenes.instruction.to(torch.int16))
-            bar.update(len(scenes))
+            lengths.append(batch.wanted.steps + 1)
+            instructions.append(batch.instruction.to(torch.int16))
+            bar.update(len(batch))
     numbering = generator(seed, "demonstrations", "tile numbers")
     codec, codes = FrameCodec.from_tiles(tile_table(tile_size), parts, numbering)
     tokens = torch.cat(instructions)
