@@ -41,7 +41,8 @@ def no_warnings():
 
 def wise(env) -> np.ndarray:
     """Actions of the expert."""
-    return expert.act(env.simulator.state, env.simulator.wanted).numpy()
+    scene = env._simulator.scene
+    return expert.act(scene.state, scene.wanted).numpy()
 
 
 def finish(env) -> tuple[dict, float, bool, bool, dict]:
@@ -174,7 +175,7 @@ def test_rgb_array_is_drawn_large():
     env.reset(seed=0)
     frame = env.render()
     assert (frame.shape, frame.dtype) == ((192, 192, 3), np.uint8)
-    expected = render(env.unwrapped.simulator.state, 32)[0].permute(1, 2, 0).numpy()
+    expected = render(env.unwrapped._simulator.state, 32)[0].permute(1, 2, 0).numpy()
     assert np.array_equal(frame, expected)
     before = frame.copy()
     for action in (1, 2):
@@ -194,7 +195,7 @@ def test_a_window_shows_the_world_and_the_instruction(monkeypatch):
         assert pygame.display.get_caption()[0] == info["instruction_text"]
         shown = window.pixels()
         assert shown.shape == (192 + LINE_HEIGHT, 192, 3)
-        world = render(env.simulator.state, 32)[0].permute(1, 2, 0).numpy()
+        world = render(env._simulator.state, 32)[0].permute(1, 2, 0).numpy()
         assert np.array_equal(shown[:192], world)
         assert len(np.unique(shown[192:].reshape(-1, 3), axis=0)) > 10  # letters
     before = window.pixels().copy()

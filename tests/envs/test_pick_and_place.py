@@ -24,13 +24,22 @@ from torchrl.testing import rollout_consistency_assertion
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
-from ifo_grounding.tasks import HOLDOUTS, TASKS, VOCABULARY, expert, grammar
+from ifo_grounding.tasks import (
+    HOLDOUTS,
+    TASKS,
+    VOCABULARY,
+    Goal,
+    Plan,
+    Scene,
+    SceneStream,
+    expert,
+    grammar,
+)
 from ifo_grounding.world import Layout, WorldState, render
 from ifo_grounding.world.dynamics import PICK_PLACE
 from reference import LETTERS, act, holds, plain, wishes
 
 OBSERVED = {"pixels", "instruction", "done", "terminated", "truncated"}
-SMALL = Layout(size=3, objects=(2, 4), boxes=(2, 3))
 
 
 def choose(env, td, actions) -> TensorDict:
@@ -55,30 +64,23 @@ def assert_same(one, other) -> None:
 # --- specs ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("num_envs", [1, 256])
-def test_specs_hold(task, num_envs):
-    env = PickAndPlaceEnv(task, num_envs=num_envs, seed=0)
-    check_env_specs(env, break_when_any_done="both")
-    assert env.batch_size == torch.Size([num_envs])
-    assert env.batch_locked
-
-
 @pytest.mark.parametrize(
     "options",
     [
+        {"num_envs": 256},
         {"instructed": False},
         {"expose_state": True},
         {"expose_state": True, "instructed": False},
         {"tile_size": 16},
-        {"layout": SMALL, "tile_size": 32},
+        {"layout": Layout(size=3, objects=(2, 4), boxes=(2, 3)), "tile_size": 32},
         {"layout": Layout(size=10), "split": "zero-shot", "stream": "evaluation"},
         {"max_steps": 7, "split": "train", "holdout": "pairs-1", "holdout_visible": False},
-        {"device": "cpu"},
     ],
 )
 def test_specs_hold_with_every_option(options):
-    check_env_specs(PickAndPlaceEnv("pick", num_envs=4, seed=0, **options))
+    env = PickAndPlaceEnv("pick", **{"num_envs": 4, "seed": 0, **options})
+    check_env_specs(env, break_when_any_done="both")
+    assert env.batch_locked
 
 
 def test_tensordicts_hold_what_the_interface_says():
@@ -95,22 +97,12 @@ def test_tensordicts_hold_what_the_interface_says():
     assert env.action_spec.space.n == 6
 
 
-@pytest.mark.parametrize("tile_size", [8, 16, 32])
-@pytest.mark.parametrize("size", range(3, 11))
-def test_every_grid_and_tile_size_runs(size, tile_size):
-    layout = Layout(size=size, objects=(2, 4), boxes=(2, 3))
-    env = PickAndPlaceEnv("pick", 2, seed=0, tile_size=tile_size, layout=layout)
-    frames = env.rollout(3, break_when_any_done=False)["next", "pixels"]
-    assert frames.shape == (2, 3, 3, size * tile_size, size * tile_size)
-
-
 # --- TorchRL's own machinery ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_inside_transforms(task):
+def test_inside_transforms():
     transforms = Compose(StepCounter(), RewardSum(), ToTensorImage(in_keys=["pixels"]))
-    env = TransformedEnv(PickAndPlaceEnv(task, num_envs=3, seed=0), transforms)
+    env = TransformedEnv(PickAndPlaceEnv("pick", num_envs=3, seed=0), transforms)
     check_env_specs(env, break_when_any_done="both")
     counts = env.rollout(100, break_when_any_done=False)["next", "step_count"]
     assert counts.max() <= 40
@@ -230,18 +222,18 @@ def test_streams_and_splits_reach_the_scenes():
 def test_steps_and_rewards_agree_with_the_plain_rules(task):
     env = PickAndPlaceEnv(task, 32, seed=0, max_steps=20)
     td = env.reset()
-    start = worlds = plain(env.simulator.state)
+    start = worlds = plain(env.truth.state)
     goals = list(wishes(grammar(task).parse_tokens(td["instruction"])))
     draw = torch.Generator().manual_seed(0)
     ends = 0
     for time in range(20):
         guess = torch.randint(6, (32,), generator=draw)
-        known = expert.act(env.simulator.state, env.simulator.wanted, draw)
+        known = expert.act(env.truth.state, env.truth.wanted, draw)
         actions = torch.where(torch.rand(32, generator=draw) < 0.1, guess, known)
         after = choose(env, td, actions)
         worlds = [act(w, LETTERS[a]) for w, a in zip(worlds, actions.tolist(), strict=True)]
-        assert plain(env.simulator.state) == worlds
-        assert torch.equal(after["pixels"], render(env.simulator.state))
+        assert plain(env.truth.state) == worlds
+        assert torch.equal(after["pixels"], render(env.truth.state))
         over = [a == STOP or time == 19 for a in actions.tolist()]
         rewards = [
             float(ended and holds(first, world, goal))
@@ -259,7 +251,7 @@ def test_the_expert_earns_one_reward_at_the_end(task):
     env = PickAndPlaceEnv(task, 64, seed=0)
 
     def policy(td):
-        return td.set("action", expert.act(env.simulator.state, env.simulator.wanted))
+        return td.set("action", expert.act(env.truth.state, env.truth.wanted))
 
     rollout = env.rollout(41, policy, break_when_all_done=True, break_when_any_done=False)
     reward, done = rollout["next", "reward"], rollout["next", "done"]
@@ -284,12 +276,12 @@ def test_success_is_judged_when_time_runs_out(late):
     """The last move of the expert comes as action 40, or one too late."""
     env = PickAndPlaceEnv("pick", 64, seed=0)
     td = env.reset()
-    scene = env.simulator.stream.scenes(env.scene_numbers)
+    scene = env._simulator.stream.scenes(env.scene_numbers)
     idles = scene.state.objects[torch.arange(64), scene.state.arm] == 0  # P does nothing there
     assert idles.sum() > 30
     begins = 40 - (scene.wanted.steps - 1) + late
     for time in range(40):
-        wise = expert.act(env.simulator.state, scene.wanted)
+        wise = expert.act(env.truth.state, scene.wanted)
         after = choose(env, td, torch.where(time < begins, PICK_PLACE, wise))
         td = after.exclude("reward")
         assert bool(after["truncated"].all()) == (time == 39)
@@ -322,7 +314,7 @@ def test_partial_resets_touch_only_their_rows():
     td = env.reset()
     for _ in range(5):
         td = choose(env, td, torch.randint(5, (6,))).exclude("reward")
-    steps = env.simulator.steps.clone()
+    steps = env._simulator.steps.clone()
     mask = torch.tensor([0, 1, 0, 0, 1, 1]).bool()
     before = td.clone()
     given = td.copy().set("_reset", mask.unsqueeze(-1))
@@ -334,7 +326,7 @@ def test_partial_resets_touch_only_their_rows():
         assert torch.equal(value[~mask], old[~mask])
     changed = (after["pixels"] != before["pixels"]).flatten(1).any(1)
     assert torch.equal(changed, mask)
-    assert torch.equal(env.simulator.steps, torch.where(mask, 0, steps))
+    assert torch.equal(env._simulator.steps, torch.where(mask, 0, steps))
     assert env.scene_numbers.tolist() == [0, 6, 2, 3, 7, 8]
     # The next step goes on from there in all rows.
     shown = choose(env, after, torch.full((6,), STOP))
@@ -350,14 +342,14 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
     for turn in range(8):
         actions = 1 + torch.randint(5, (256,))
         running = choose(env, td, actions).exclude("reward").set("action", actions)
-        assert torch.equal(running["pixels"], render(env.simulator.state))
+        assert torch.equal(running["pixels"], render(env._simulator.state))
         numbers, mask = env.scene_numbers.clone(), torch.rand(256) < 0.2
         given = running.clone().set("_reset", mask.unsqueeze(-1))
         if foreign:
             given["logits"] = torch.full((256, 6), torch.inf)
             given["collector", "number"] = torch.arange(1, 257)
         td = env.reset(given)
-        assert torch.equal(td["pixels"], render(env.simulator.state))
+        assert torch.equal(td["pixels"], render(env._simulator.state))
         assert torch.equal(td["done"], running["done"] & ~mask.unsqueeze(-1))
         assert torch.equal(td["action"], actions * ~mask)
         assert torch.equal(env.scene_numbers != numbers, mask)
@@ -366,13 +358,14 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
             assert torch.equal(td["logits"] == 0, mask.unsqueeze(-1).expand(-1, 6))
             assert torch.equal(td["collector", "number"], torch.arange(1, 257) * ~mask)
         if instructed:
-            began = env.simulator.stream.scenes(env.scene_numbers)
+            began = env._simulator.stream.scenes(env.scene_numbers)
             assert torch.equal(td["instruction"], began.instruction)
-            assert torch.equal(env.simulator.wanted.objects, began.wanted.objects)
+            assert torch.equal(env.truth.wanted.objects, began.wanted.objects)
         if turn % 2:  # twice, and a step, before anybody looks
-            env.simulator.reset(mask.nonzero().squeeze(-1)[:3])
-            env.simulator.step(torch.randint(5, (256,)))
-            assert torch.equal(env.simulator.pixels(), render(env.simulator.state))
+            env._simulator.reset(mask.nonzero().squeeze(-1)[:3])
+            env._simulator.step(torch.randint(5, (256,)))
+            td.update(env._observe())
+            assert torch.equal(td["pixels"], render(env._simulator.state))
 
 
 def test_a_reset_of_no_row_changes_nothing():
@@ -393,6 +386,43 @@ def test_partial_resets_can_name_their_scenes():
     assert env.scene_numbers.tolist() == [0, 51, 2]
 
 
+# --- one's own sentence --------------------------------------------------------------------------
+
+
+def own(env, text, **more) -> TensorDict:
+    """A reset to the scenes as they are, with another instruction."""
+    tokens = VOCABULARY.encode(text).expand(env.num_envs, -1)
+    scene = env.scene_numbers.unsqueeze(-1)
+    return TensorDict({"scene": scene, "instruction": tokens, **more}, [env.num_envs])
+
+
+def test_a_reset_takes_one_s_own_sentence():
+    env = PickAndPlaceEnv("move", 64, seed=0)
+    first = env.reset().clone()
+    td = env.reset(own(env, "move to the red circle"))
+    assert torch.equal(td["pixels"], first["pixels"])
+    assert set(VOCABULARY.decode(td["instruction"])) == {"move to the red circle"}
+    suits = env.truth.wanted.verdict == 0
+    assert 5 < suits.sum() < 60
+    paid = torch.zeros(64, 1)
+    for _ in range(12):
+        td = choose(env, td, expert.act(env.truth.state, env.truth.wanted))
+        paid += td.pop("reward")
+    assert (paid[suits] >= 1).all()
+    with pytest.raises(UserError, match="'put it' is no sentence of move"):
+        env.reset(own(env, "put it"))
+    # What a past observation shows is no wish.
+    past = own(env, "move to the red circle", pixels=td["pixels"])
+    assert torch.equal(env.reset(past)["instruction"], first["instruction"])
+
+
+def test_another_sentence_amid_an_episode_is_refused():
+    env = PickAndPlaceEnv("move", 3, seed=0)
+    td = env.reset().set("instruction", VOCABULARY.encode("move to the red circle").expand(3, -1))
+    with pytest.raises(UserError, match=r"give it to reset\(\), in a TensorDict of 'scene'"):
+        env.rollout(2, auto_reset=False, tensordict=td)
+
+
 # --- without instructions, with the state --------------------------------------------------------
 
 
@@ -403,6 +433,24 @@ def test_without_instructions_there_is_no_goal_and_no_reward():
     assert "instruction" not in rollout["next"]
     assert rollout["next", "terminated"].any()
     assert not rollout["next", "reward"].any()
+
+
+def test_a_learner_s_environment_hides_what_is_true():
+    """Neither its attributes nor its specs hold a state; what it keeps to itself, no goal."""
+    env = PickAndPlaceEnv("pick", 4, seed=0, instructed=False)
+    env.rollout(3)
+    names = {*vars(env), *vars(PickAndPlaceEnv)} - {"truth"}
+    values = [getattr(env, name) for name in names if not name.startswith("_")]
+    values += [v for value in values for v in getattr(value, "__dict__", {}).values()]
+    assert not any(isinstance(v, WorldState | Scene | Plan | Goal | SceneStream) for v in values)
+    for spec in (env.output_spec, env.input_spec):
+        parts = {part for key in spec.keys(True, True) for part in key}
+        assert not {"state", "objects", "instruction"} & parts
+    with pytest.raises(UserError, match="keeps its true state to itself"):
+        _ = env.truth
+    for kept in (env, pickle.loads(pickle.dumps(env))):
+        scenes = [kept._simulator.scene, kept._simulator.stream.scenes(torch.arange(50))]
+        assert not any(s.instruction.any() or s.wanted.objects.any() for s in scenes)
 
 
 def test_the_state_is_hidden():
@@ -433,13 +481,13 @@ def test_an_episode_can_begin_in_a_given_state():
     assert_same(again, first)
     assert env.scene_numbers.tolist() == [-1] * 5
     for _ in range(40):
-        wise = expert.act(env.simulator.state, env.simulator.wanted)
+        wise = expert.act(env.truth.state, env.truth.wanted)
         again = choose(env, again, wise).exclude("reward")
         if again["done"].all():
             break
     goals = grammar("pick-out").parse_tokens(first["instruction"])
     start = WorldState(**first["state"].to_dict(), batch_size=[5])
-    ends = zip(plain(start), plain(env.simulator.state), wishes(goals), strict=True)
+    ends = zip(plain(start), plain(env.truth.state), wishes(goals), strict=True)
     assert all(holds(*episode) for episode in ends)
 
 
@@ -467,7 +515,7 @@ def test_render_draws_every_world_large():
     frames = env.render()
     assert isinstance(frames, np.ndarray)
     assert (frames.shape, frames.dtype) == ((3, 192, 192, 3), np.uint8)
-    expected = render(env.simulator.state, 32).permute(0, 2, 3, 1).numpy()
+    expected = render(env.truth.state, 32).permute(0, 2, 3, 1).numpy()
     assert np.array_equal(frames, expected)
     assert env.render(tile_size=16).shape == (3, 96, 96, 3)
 
@@ -496,7 +544,7 @@ def test_actions_of_another_shape_are_refused(shape):
     env = PickAndPlaceEnv("move", 4, seed=0)
     env.reset()
     with pytest.raises(UserError, match="one integer for each of 4 worlds"):
-        env.simulator.step(torch.zeros(shape, dtype=torch.int64))
+        env._simulator.step(torch.zeros(shape, dtype=torch.int64))
 
 
 def test_bad_resets_are_refused():
@@ -510,7 +558,7 @@ def test_bad_resets_are_refused():
 
 
 def moved(env):
-    assert str(env.to("cpu:0").simulator.device) == "cpu:0"
+    assert str(env.to("cpu:0")._simulator.device) == "cpu:0"
     return env
 
 
@@ -530,7 +578,7 @@ def test_a_copied_or_moved_env_goes_on(change):
         step, shown = env.step_and_maybe_reset(shown.set("action", action))
         same, ahead = other.step_and_maybe_reset(ahead.set("action", action))
         assert (step == same).all()
-        wanted = env.simulator.wanted.clone(), other.simulator.wanted.clone()
+        wanted = env.truth.wanted.clone(), other.truth.wanted.clone()
         assert (wanted[0] == wanted[1]).all()
 
 
@@ -578,7 +626,7 @@ def deterministic():
 def test_many_worlds_run_with_deterministic_algorithms():
     env = PickAndPlaceEnv("pick", num_envs=300, seed=0)
     rollout = env.rollout(8, break_when_any_done=False)
-    assert torch.equal(rollout["next", "pixels"][:, -1], env.simulator.pixels(tile_size=8))
+    assert torch.equal(rollout["next", "pixels"][:, -1], env._simulator.pixels(tile_size=8))
 
 
 def test_scene_numbers_that_were_read_stay_what_they_were():

@@ -3,10 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ifo_grounding.data import recombined, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import HOLDOUTS, N_TEMPLATES, PHRASINGS, SPLITS, TASKS, VOCABULARY, grammar
-from ifo_grounding.tasks.goals import suitable
 from ifo_grounding.tasks.grammar import FIELDS, holdout_kinds, in_split
 from ifo_grounding.world import COLOURS, SHAPES, kind, random_layout
 from reference import draw_goal
@@ -91,14 +89,6 @@ def test_every_sentence_goes_to_its_goal_and_back(task):
             (5, 11, 0, 0, 3),
         ),
         ("put the red triangle above the red circle", "pick-udlr", (4, 1, 0, 0, 0)),
-        # Read, but said by nobody.
-        ("move the red circle from the pink box into the pink box", "pick-out", (1, 0, 4, 4, 0)),
-        (
-            "remove the red circle from the cyan box and drop it into the pink box",
-            "pick-out",
-            (1, 0, 7, 4, 0),
-        ),
-        ("place the red circle below the red circle", "pick-udlr", (1, 1, 0, 0, 2)),
     ],
 )
 def test_sentences_by_hand(sentence, task, fields):
@@ -106,8 +96,8 @@ def test_sentences_by_hand(sentence, task, fields):
     assert tuple(int(getattr(goal, name)) for name in FIELDS) == fields
 
 
-def test_the_parser_forgives_capitals_and_spaces():
-    assert int(grammar("move").parse("  Move to the RED   circle ").object) == 1
+def test_the_parser_forgives_capitals_spaces_and_punctuation():
+    assert int(grammar("move").parse("  Move to the RED   circle. ").object) == 1
 
 
 @pytest.mark.parametrize("sentence", ["fly to the red circle", "move to the red", "", "move"])
@@ -121,27 +111,6 @@ def test_tokens_are_parsed_row_by_row():
     rows = torch.tensor([5, 700, 5, 0])
     goals = known.parse_tokens(known.tokens[rows])
     assert (goals == known.goals[rows]).all()
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("n", [40, 2000])
-def test_whatever_words_are_exchanged_the_oracle_reads_it(task, n):
-    new = recombined(record_demonstrations(task, n, seed=1).pool())
-    assert len(grammar(task).parse_tokens(new)) == len(new)
-
-
-@pytest.mark.parametrize("task", ["pick-out", "pick-udlr"])
-def test_what_makes_no_sense_suits_no_state_and_is_said_by_nobody(task):
-    pool = record_demonstrations(task, 300, seed=0).pool()
-    new = recombined(pool)
-    goals = grammar(task).parse_tokens(new)
-    roles = ("source", "target") if task == "pick-out" else ("object", "reference")
-    senseless = goals[getattr(goals, roles[0]) == getattr(goals, roles[1])]
-    assert 0 < len(senseless) < len(new)
-    states = random_layout(len(senseless), generator=torch.Generator().manual_seed(0))
-    assert not suitable(states, senseless).any()
-    with pytest.raises(UserError, match=f"no sentence of {task}"):
-        grammar(task).encode(senseless, torch.zeros(len(senseless), dtype=torch.int64))
 
 
 def test_a_goal_that_no_sentence_expresses_is_refused():

@@ -152,7 +152,7 @@ def _play(
     policy: Policy, env: PickAndPlaceEnv, start: TensorDictBase, mode: str
 ) -> Iterator[Tensor]:
     """Yield how each row's episode ended, wanted and mistaken objects [B], and actions [B, T]."""
-    first, wanted = env.simulator.state.clone(), env.simulator.wanted.clone()
+    first, wanted = env.truth.state.clone(), env.truth.wanted.clone()
     goal = grammar(env.task).parse_tokens(start[keys.INSTRUCTION])
     last = first.clone()
     shape = (env.num_envs, env.options.max_steps)
@@ -160,7 +160,7 @@ def _play(
     taken = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
 
     def keep(rows: Tensor, transition: TensorDictBase) -> None:
-        last[rows] = env.simulator.state[rows]
+        last[rows] = env.truth.state[rows]
         actions[rows, taken[rows]] = transition[keys.ACTION].to(torch.int8)
         taken[rows] += 1
 

@@ -129,9 +129,9 @@ def _scenes(task: str, count: int, device: torch.device, **options: Any) -> _Sce
     return _Scenes(
         start[keys.PIXELS],
         start[keys.INSTRUCTION],
-        env.simulator.state.objects.long(),
+        env.truth.state.objects.long(),
         goal.object.long(),
-        env.simulator.wanted.object_cell,
+        env.truth.wanted.object_cell,
     )
 
 
