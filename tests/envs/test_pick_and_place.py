@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.envs import (
     Compose,
     ParallelEnv,
@@ -25,7 +24,6 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
 from ifo_grounding.tasks import (
-    HOLDOUTS,
     TASKS,
     VOCABULARY,
     Goal,
@@ -140,16 +138,6 @@ def test_rollouts_are_consistent_across_resets():
     rollout_consistency_assertion(rollout, observation_key="instruction")
 
 
-def test_a_collector_gathers_frames():
-    collector = Collector(
-        PickAndPlaceEnv("move", 4, seed=0), None, frames_per_batch=40, total_frames=80
-    )
-    batches = [batch.clone() for batch in collector]
-    collector.shutdown()
-    assert [batch.batch_size for batch in batches] == [torch.Size([4, 10])] * 2
-    assert batches[0]["pixels"].dtype == torch.uint8
-
-
 # --- seeds and scenes ----------------------------------------------------------------------------
 
 
@@ -172,11 +160,6 @@ def test_set_seed_starts_over():
     assert_same(env.reset(), first)
 
 
-def test_without_a_seed_envs_differ():
-    one, other = (PickAndPlaceEnv("move", 8).reset()["pixels"] for _ in range(2))
-    assert not torch.equal(one, other)
-
-
 def test_scenes_can_be_asked_for_by_number():
     env = PickAndPlaceEnv("pick", 3, seed=0)
     stream = torch.cat([env.reset().clone() for _ in range(4)])
@@ -189,12 +172,6 @@ def test_scenes_can_be_asked_for_by_number():
     assert env.scene_numbers.tolist() == [12, 13, 14]
 
 
-def test_the_number_of_envs_does_not_change_the_scenes():
-    together = PickAndPlaceEnv("pick", 6, seed=0).reset()
-    alone = PickAndPlaceEnv("pick", 1, seed=0)
-    assert torch.equal(torch.cat([alone.reset()["pixels"] for _ in range(6)]), together["pixels"])
-
-
 def test_an_asked_scene_is_not_repeated_after_its_episode():
     env = PickAndPlaceEnv("move", 2, seed=0)
     td = env.reset(scenes(40, 41))
@@ -202,17 +179,6 @@ def test_an_asked_scene_is_not_repeated_after_its_episode():
     env.rollout(3, policy, auto_reset=False, tensordict=td, break_when_any_done=False)
     # Two steps brought resets (the last step's end is left to the caller).
     assert env.scene_numbers.tolist() == [2, 3]
-
-
-def test_streams_and_splits_reach_the_scenes():
-    frames = [
-        PickAndPlaceEnv("pick", 50, seed=0, stream=stream).reset()["pixels"]
-        for stream in ("training", "validation", "evaluation")
-    ]
-    assert len(torch.cat(frames).flatten(1).unique(dim=0)) == 150
-    novel = PickAndPlaceEnv("pick", 50, seed=0, split="zero-shot", holdout="pairs-1").reset()
-    sentences = VOCABULARY.decode(novel["instruction"])
-    assert all(HOLDOUTS["pairs-1"][0] in sentence for sentence in sentences)
 
 
 # --- episodes ------------------------------------------------------------------------------------
@@ -244,31 +210,6 @@ def test_steps_and_rewards_agree_with_the_plain_rules(task):
         ends += sum(rewards)
         td = after.exclude("reward")
     assert ends > 16
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_the_expert_earns_one_reward_at_the_end(task):
-    env = PickAndPlaceEnv(task, 64, seed=0)
-
-    def policy(td):
-        return td.set("action", expert.act(env.truth.state, env.truth.wanted))
-
-    rollout = env.rollout(41, policy, break_when_all_done=True, break_when_any_done=False)
-    reward, done = rollout["next", "reward"], rollout["next", "done"]
-    first = done.cumsum(1).cumsum(1) == 1
-    assert (reward[first] == 1).all()
-    assert first.sum() == 64
-    assert rollout["next", "terminated"][first].all()
-    assert not reward[done.cumsum(1) == 0].any()
-
-
-def test_a_stop_at_once_ends_the_episode_without_reward():
-    env = PickAndPlaceEnv("pick", 16, seed=0)
-    after = choose(env, env.reset(), torch.full((16,), STOP))
-    assert after["terminated"].all()
-    assert after["done"].all()
-    assert not after["truncated"].any()
-    assert not after["reward"].any()
 
 
 @pytest.mark.parametrize("late", [0, 1])
@@ -537,14 +478,6 @@ def test_render_draws_every_world_large():
 def test_bad_arguments_are_refused(wrong, said):
     with pytest.raises(UserError, match=said):
         PickAndPlaceEnv(**wrong)
-
-
-@pytest.mark.parametrize("shape", [(4, 6), (4, 1), (3,)])
-def test_actions_of_another_shape_are_refused(shape):
-    env = PickAndPlaceEnv("move", 4, seed=0)
-    env.reset()
-    with pytest.raises(UserError, match="one integer for each of 4 worlds"):
-        env._simulator.step(torch.zeros(shape, dtype=torch.int64))
 
 
 def test_bad_resets_are_refused():

@@ -1,7 +1,5 @@
 """Worlds that the project did not make, behind its keys."""
 
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
@@ -145,19 +143,6 @@ def test_processes_show_what_one_process_shows():
     apart.close()
     for key in ("pixels", "instruction", "action", ("next", "reward")):
         assert torch.equal(apart.seen[key], together.seen[key])
-
-
-def test_it_can_be_copied():
-    env = from_gymnasium(
-        "ifo_grounding/Move-v0",
-        vocabulary=VOCABULARY,
-        num_envs=2,
-        image="pixels",
-        instruction="instruction_text",
-        seed=0,
-    )
-    copied = pickle.loads(pickle.dumps(env))
-    assert (env.reset() == copied.reset()).all()
 
 
 def test_policies_and_evaluation_take_it_as_it_is():
@@ -304,26 +289,6 @@ def test_it_says_which_action_is_the_stop(stop, named):
     stopped = rollout["action"] == named
     assert stopped.any() and torch.equal(rollout["next", "learned_reward"][..., 0] > 0, stopped)
     assert torch.equal(rollout["next", "terminated"][..., 0], stopped)
-
-
-def test_arrival_is_paid_where_nobody_stops():
-    env = dials(6, instructed=False)
-    four = MARKS.index("four")
-
-    def there(pixels):
-        return 8.0 * (shown(pixels) == four).float().unsqueeze(-1) - 4.0
-
-    judge = TensorDictModule(there, ["pixels"], ["goal_score"])
-    paid = TransformedEnv(env, GoalReward(judge, stop_action=None, arrival=0.9))
-    check_env_specs(paid)
-    rollout = paid.rollout(60, break_when_any_done=False)
-    after = rollout["next"]
-    reached = shown(after["pixels"].flatten(0, 1)).view(6, 60) == four
-    assert reached.any() and not reached.all()
-    assert torch.equal(after["terminated"][..., 0], reached)
-    assert (after["done"] >= after["terminated"]).all()
-    sure = torch.tensor(4.0).sigmoid()
-    assert torch.allclose(after["learned_reward"][..., 0], reached * sure)
 
 
 @pytest.mark.parametrize("shape", [(20, 28), (1, 20, 28), (20, 28, 1), (3, 20, 28)])

@@ -7,12 +7,12 @@ from collections import Counter
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, StepCounter, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
-from ifo_grounding.transforms import LearnedReward, StartingPairs, frame_hash
-from transforms.counter_world import CounterWorld, reward_model
+from ifo_grounding.transforms import StartingPairs, frame_hash
+from transforms.counter_world import CounterWorld
 
 
 def make_pairs(count=7, length=4):
@@ -86,14 +86,6 @@ def test_state_dict_resumes_the_order():
     starts(env, 3)
     other.load_state_dict(env.state_dict())
     assert starts(env, 10) == starts(other, 10)
-
-
-def test_composes_with_other_transforms():
-    transforms = Compose(StepCounter(), StartingPairs(make_pairs()), LearnedReward(reward_model()))
-    env = TransformedEnv(CounterWorld((3,)), transforms)
-    rollout = env.rollout(30, break_when_any_done=False)
-    assert rollout["next", "learned_reward"].shape == (3, 30, 1)
-    assert (rollout["instruction"][..., 1] % 3 == 1).all()
 
 
 def test_the_real_world_begins_with_the_scenes():

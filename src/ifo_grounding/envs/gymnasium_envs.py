@@ -16,7 +16,6 @@ from gymnasium.vector.utils import batch_space
 
 from ifo_grounding.envs.gymnasium_shared import (
     Observation,
-    Sentences,
     act,
     check_options,
     draw_frames,
@@ -25,6 +24,7 @@ from ifo_grounding.envs.gymnasium_shared import (
     observe,
     scene_numbers,
     seed_stream,
+    sentences,
 )
 from ifo_grounding.envs.window import Window
 from ifo_grounding.errors import UserError, check_choice
@@ -76,7 +76,6 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         self.render_mode = render_mode
         self._simulator = make_simulator(task, 1, tile_size, device, scene_options)
         self.observation_space, self.action_space = make_spaces(self._simulator)
-        self._sentences = Sentences(task)
         self._text = ""
         self._row = torch.zeros(1, dtype=torch.int64, device=self._simulator.device)
         self._window = Window(RENDER_FPS) if render_mode == "human" else None
@@ -90,7 +89,7 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         seed_stream(self._simulator, seed, self.np_random)
         number = None if scene is None else scene_numbers(scene, 1, self._simulator.device)
         self._simulator.reset(self._row, number)
-        self._text = self._sentences.of(self._simulator.instruction)[0]
+        self._text = sentences(self._simulator.instruction)[0]
         self._show()
         return self._observe(), {TEXT: self._text}
 
@@ -179,7 +178,6 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         self.single_observation_space, self.single_action_space = make_spaces(self._simulator)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._sentences = Sentences(task)
         self._texts = np.full(num_envs, "", dtype=object)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
 
@@ -248,7 +246,7 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         if scenes is not None:
             numbers = scene_numbers(scenes, self.num_envs, self._simulator.device)[rows]
         self._simulator.reset(rows, numbers)
-        self._texts[mask] = self._sentences.of(self._simulator.instruction[rows])
+        self._texts[mask] = sentences(self._simulator.instruction[rows])
         self._ended = self._ended & ~mask
 
     def _final(

@@ -1,4 +1,4 @@
-"""An instruction for every episode, chosen by a learned judge of suitability."""
+"""An instruction for every episode, chosen by a learned classifier of suitability."""
 
 from __future__ import annotations
 
@@ -145,10 +145,7 @@ class InstructionSampler(InstructionTransform):
         self._score_sum = 0.0
 
     def _choose(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        if self.scorer.classifier is not self.classifier:  # another one was put there
-            scored = self.scorer.scored
-            self.scorer = PoolScorer(self.classifier, self.scorer.pool, self.in_keys[0])
-            self.scorer.scored = scored
+        self.scorer.classifier = self.classifier  # another one may have been put there
         index, score = choose_instructions(
             self.scorer,
             None,

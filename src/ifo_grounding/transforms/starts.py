@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
@@ -33,8 +35,8 @@ class StartingPairs(InstructionTransform):
         pairs: TensorDict [N] with ``scene`` int64 [N, 1] and ``instruction`` int64 [N, L]. With
             ``frame_hash`` int64 [N, 1], every scene is checked to be the one that was stored.
         seed: seed of the order.
-        instruction_key: key of the instruction in the environment.
-        pixels_key: key of the image.
+        in_keys: key of the image.
+        out_keys: key of the instruction in the environment.
         vocabulary_size: number of token ids, for the spec; by default that of the environment, or
             else one more than the largest id of the pairs.
 
@@ -59,11 +61,11 @@ class StartingPairs(InstructionTransform):
         self,
         pairs: TensorDictBase,
         seed: int = 0,
-        instruction_key: NestedKey = INSTRUCTION,
-        pixels_key: NestedKey = PIXELS,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
         vocabulary_size: int | None = None,
     ) -> None:
-        super().__init__(in_keys=[pixels_key], out_keys=[instruction_key])
+        super().__init__(in_keys=in_keys or [PIXELS], out_keys=out_keys or [INSTRUCTION])
         pairs = check_pairs(pairs)
         self.vocabulary_size = vocabulary_size
         self.register_buffer("scenes", pairs[SCENE].reshape(-1), persistent=False)
