@@ -122,7 +122,9 @@ class PickAndPlaceEnv(EnvBase):
 
     @property
     def truth(self) -> Scene:
-        """The worlds as they are and what they are asked, [num_envs]; for evaluation only.
+        """The worlds as they are and what they are asked, [num_envs]; clone what is to be kept.
+
+        For evaluation only.
 
         Raises:
             UserError: where ``instructed=False``, as a learner's environment is.

@@ -208,7 +208,7 @@ class Simulator:
         """Apply one action, int64 [num_envs], to each row.
 
         Returns:
-            Success, terminated and truncated, bool [num_envs] each. Success is judged when an
+            Success, terminated and truncated, bool [num_envs] each. Success is told when an
             episode ends, and always false where there are no instructions.
 
         Raises:
