@@ -201,7 +201,7 @@ class PickAndPlaceEnv(EnvBase):
             if numbers is not None:
                 numbers = numbers.reshape(self.num_envs)[rows]
             self._simulator.reset(rows, numbers)
-            if keys.PIXELS in given:  # an observation, whose instruction is over
+            if numbers is None or keys.PIXELS in given:  # an observation, whose instruction is over
                 tokens = None
         if tokens is not None:
             self._simulator.ask(rows, tokens[rows])
