@@ -19,7 +19,7 @@ import ifo_grounding
 from ifo_grounding.envs.gymnasium_envs import PickAndPlaceGymEnv, PickAndPlaceVectorEnv
 from ifo_grounding.envs.window import LINE_HEIGHT
 from ifo_grounding.errors import UserError
-from ifo_grounding.tasks import TASKS, VOCABULARY, expert
+from ifo_grounding.tasks import TASKS, VOCABULARY
 from ifo_grounding.world import Layout, render
 
 IDS = dict(zip(("Move", "MoveUDLR", "Pick", "PickOut", "PickUDLR"), TASKS, strict=True))
@@ -33,12 +33,6 @@ def no_warnings():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
-
-
-def wise(env) -> np.ndarray:
-    """Actions of the expert."""
-    scene = env._simulator.scene
-    return expert.act(scene.state, scene.wanted).numpy()
 
 
 # --- registration --------------------------------------------------------------------------------
