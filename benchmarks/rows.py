@@ -149,14 +149,14 @@ def env_rollout() -> Row:
     def simulate() -> float:
         rows = torch.arange(batch, device=DEVICE)
         for _ in range(times):
-            bare.simulator.reset(rows)
+            bare._simulator.reset(rows)
             for action in torch.randint(6, (steps, batch), device=DEVICE):
-                _, terminated, truncated = bare.simulator.step(action)
-                bare.simulator.pixels()
+                _, terminated, truncated = bare._simulator.step(action)
+                bare._simulator.pixels()
                 ended = (terminated | truncated).nonzero().squeeze(-1)
                 if len(ended):
-                    bare.simulator.reset(ended)
-                    bare.simulator.pixels()
+                    bare._simulator.reset(ended)
+                    bare._simulator.pixels()
         return batch * steps * times
 
     return Row(

@@ -13,8 +13,9 @@ from torchrl.data import (
 )
 from torchrl.envs import Compose
 
-from ifo_grounding.data import FrameCodec
-from ifo_grounding.transforms.decode import FrameDecoder, Lookup
+from ifo_grounding.data import FrameCodec, FrameDecoder
+from ifo_grounding.data.decoding import Lookup
+from ifo_grounding.errors import UserError
 from ifo_grounding.world import random_layout, render
 
 

@@ -1,7 +1,5 @@
 """Worlds that the project did not make, behind its keys."""
 
-import pickle
-
 import gymnasium
 import numpy as np
 import pytest
@@ -109,12 +107,6 @@ def test_what_is_no_number_of_a_scene_is_refused(scene):
         env.reset(TensorDict({"scene": torch.tensor([[0], [scene]])}, [2]))
 
 
-def test_rollouts_go_on_after_episodes_end():
-    rollout = dials(3).rollout(40, break_when_any_done=False)
-    assert rollout["next", "terminated"].any()
-    assert ((rollout["next", "reward"] == 1) <= rollout["next", "done"]).all()
-
-
 def test_a_learner_sees_neither_reward_nor_the_world_s_own_goal():
     env = dials(8, instructed=False, seed=1)
     rollout = env.rollout(60, break_when_any_done=False)
@@ -145,19 +137,6 @@ def test_processes_show_what_one_process_shows():
     apart.close()
     for key in ("pixels", "instruction", "action", ("next", "reward")):
         assert torch.equal(apart.seen[key], together.seen[key])
-
-
-def test_it_can_be_copied():
-    env = from_gymnasium(
-        "ifo_grounding/Move-v0",
-        vocabulary=VOCABULARY,
-        num_envs=2,
-        image="pixels",
-        instruction="instruction_text",
-        seed=0,
-    )
-    copied = pickle.loads(pickle.dumps(env))
-    assert (env.reset() == copied.reset()).all()
 
 
 def test_policies_and_evaluation_take_it_as_it_is():
@@ -278,13 +257,6 @@ def test_actions_that_the_world_has_not_are_refused(stop, action):
         env.step(env.reset().set("action", torch.tensor([0, action])))
 
 
-@pytest.mark.parametrize("actions", [[[0, 1, 0], [1, 0, 0]], [[0], [1]], [0.0, 1.0]])
-def test_actions_are_one_whole_number_each(actions):
-    env = dials(2)
-    with pytest.raises(UserError, match="one integer for each of 2 worlds"):
-        env.step(env.reset().set("action", torch.tensor(actions)))
-
-
 @pytest.mark.parametrize(("stop", "named"), [(None, None), (PRESS, PRESS), ("add", 3)])
 def test_it_says_which_action_is_the_stop(stop, named):
     env = dials(20, stop=stop, instructed=False)
@@ -304,26 +276,6 @@ def test_it_says_which_action_is_the_stop(stop, named):
     stopped = rollout["action"] == named
     assert stopped.any() and torch.equal(rollout["next", "learned_reward"][..., 0] > 0, stopped)
     assert torch.equal(rollout["next", "terminated"][..., 0], stopped)
-
-
-def test_arrival_is_paid_where_nobody_stops():
-    env = dials(6, instructed=False)
-    four = MARKS.index("four")
-
-    def there(pixels):
-        return 8.0 * (shown(pixels) == four).float().unsqueeze(-1) - 4.0
-
-    judge = TensorDictModule(there, ["pixels"], ["goal_score"])
-    paid = TransformedEnv(env, GoalReward(judge, stop_action=None, arrival=0.9))
-    check_env_specs(paid)
-    rollout = paid.rollout(60, break_when_any_done=False)
-    after = rollout["next"]
-    reached = shown(after["pixels"].flatten(0, 1)).view(6, 60) == four
-    assert reached.any() and not reached.all()
-    assert torch.equal(after["terminated"][..., 0], reached)
-    assert (after["done"] >= after["terminated"]).all()
-    sure = torch.tensor(4.0).sigmoid()
-    assert torch.allclose(after["learned_reward"][..., 0], reached * sure)
 
 
 @pytest.mark.parametrize("shape", [(20, 28), (1, 20, 28), (20, 28, 1), (3, 20, 28)])
@@ -347,30 +299,6 @@ def test_babyai_shows_its_room_and_says_its_mission():
     td = env.reset()
     assert td["pixels"].shape == (2, 3, 64, 64)
     assert all(text.startswith("go to the") for text in words.decode(td["instruction"]))
-
-
-def test_success_is_measured_in_the_stream_that_is_asked_for():
-    env = dials(4)
-    streams = ("training", "validation", "evaluation")
-    policy = make_policy(env, seed=0, features=8)
-    found = {name: success_rate(policy, env, episodes=8, seed=3, stream=name) for name in streams}
-    assert len({result.scenes for result in found.values()}) == 3
-    assert env.stream == "training"
-    with pytest.raises(UserError, match="stream"):
-        success_rate(policy, env, episodes=8, stream="test")
-
-
-def test_who_steps_before_a_reset_is_told():
-    with pytest.raises(UserError, match="reset the environment first"):
-        dials(2).step(TensorDict({"action": torch.zeros(2).long()}, [2]))
-
-
-def test_scene_numbers_that_were_read_stay_what_they_were():
-    env = dials(2)
-    env.reset()
-    noted = env.scene_numbers
-    env.reset()
-    assert noted.tolist() == [0, 1]
 
 
 def test_episodes_that_begin_in_inference_mode_go_on_outside():

@@ -18,7 +18,7 @@ class Scripted:
     def __init__(self, task, rule):
         env = PickAndPlaceEnv(task, EPISODES, seed=0, stream="evaluation")
         env.reset()
-        scene = env.simulator.stream.scenes(env.scene_numbers)
+        scene = env._simulator.stream.scenes(env.scene_numbers)
         goals = grammar(task).parse_tokens(scene.instruction)
         self.plans = [rule(scene[row], goals[row]) for row in range(EPISODES)]
         self.step = 0

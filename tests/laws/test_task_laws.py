@@ -12,8 +12,6 @@ from ifo_grounding.tasks import (
     REASONS,
     TASKS,
     VOCABULARY,
-    SceneOptions,
-    SceneStream,
     achieved,
     grammar,
     plan,
@@ -114,16 +112,3 @@ def test_sentences_survive_tokens_and_goals(task, data):
     assert again == sentence
     wording = torch.tensor([row % len(PHRASINGS[task])])
     assert VOCABULARY.decode(known.encode(known.parse(sentence), wording)) == [sentence]
-
-
-@settings(law, max_examples=8)
-@given(tasks, st.integers(0, 2**40), st.lists(st.integers(0, 3000), min_size=1, max_size=8))
-def test_scenes_are_a_function_of_seed_and_number(task, seed, numbers):
-    def stream() -> SceneStream:
-        return SceneStream(SceneOptions(task), seed)
-
-    together = stream().scenes(torch.tensor(numbers))
-    one, other = stream(), torch.tensor(numbers)
-    alone = torch.cat([one.scenes(number[None]) for number in other.flip(0)]).flip(0)
-    assert (together == alone).all()
-    assert (together.wanted.verdict == 0).all()

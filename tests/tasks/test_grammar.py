@@ -89,14 +89,6 @@ def test_every_sentence_goes_to_its_goal_and_back(task):
             (5, 11, 0, 0, 3),
         ),
         ("put the red triangle above the red circle", "pick-udlr", (4, 1, 0, 0, 0)),
-        # Read, but said by nobody.
-        ("move the red circle from the pink box into the pink box", "pick-out", (1, 0, 4, 4, 0)),
-        (
-            "remove the red circle from the cyan box and drop it into the pink box",
-            "pick-out",
-            (1, 0, 7, 4, 0),
-        ),
-        ("place the red circle below the red circle", "pick-udlr", (1, 1, 0, 0, 2)),
     ],
 )
 def test_sentences_by_hand(sentence, task, fields):
@@ -104,8 +96,8 @@ def test_sentences_by_hand(sentence, task, fields):
     assert tuple(int(getattr(goal, name)) for name in FIELDS) == fields
 
 
-def test_the_parser_forgives_capitals_and_spaces():
-    assert int(grammar("move").parse("  Move to the RED   circle ").object) == 1
+def test_the_parser_forgives_capitals_spaces_and_punctuation():
+    assert int(grammar("move").parse("  Move to the RED   circle. ").object) == 1
 
 
 @pytest.mark.parametrize("sentence", ["fly to the red circle", "move to the red", "", "move"])

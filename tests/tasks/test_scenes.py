@@ -112,11 +112,6 @@ def test_scenes_stay_what_they_are():
     assert digest.hexdigest()[:16] == "49e349ca8fb375ae"
 
 
-def test_the_same_seed_gives_the_same_scenes_and_another_seed_others():
-    assert same(first(100, task="pick"), first(100, task="pick"))
-    assert not looks(first(1000, task="pick")) & looks(first(1000, seed=1, task="pick"))
-
-
 def test_streams_are_disjoint():
     assert STREAMS == ("training", "validation", "evaluation")
     seen: set[bytes] = set()
@@ -129,12 +124,13 @@ def test_streams_are_disjoint():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_instructed_scenes_are_the_others_conditioned_by_rejection_only(task):
-    """Where their goal suits, the free scenes of the first block are the first instructed ones."""
-    free = first(CHUNK, task=task, instructed=False)
-    kept = free[free.wanted.verdict == 0]
-    assert 100 < len(kept) < CHUNK
-    instructed = first(len(kept), task=task)
-    assert same(kept.state, instructed.state)
+    """Free scenes are drawn first; instructed ones are those whose goal suits, in their order."""
+    free, asked = (
+        [row.tobytes() for row in first(n, task=task, instructed=told).state.objects.numpy()]
+        for n, told in ((CHUNK, False), (100, True))
+    )
+    places = [free.index(row) for row in asked]
+    assert places == sorted(set(places)) and places[-1] > 99
 
 
 def test_scenes_without_instructions_do_not_depend_on_the_split():
@@ -169,15 +165,6 @@ def test_wordings_are_equally_likely():
     assert sum(verbs) == 4000
     assert all(abs(count - 4000 / 3) < 5 * (4000 * 2 / 9) ** 0.5 for count in verbs)
     assert abs(sum(s.startswith("pick up") for s in sentences) - 2000) < 5 * 1000**0.5
-
-
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("size", [3, 4, 10])
-def test_other_grids_have_scenes(task, size):
-    layout = Layout(size=size, objects=(2, 4), boxes=(2, 3))
-    scenes = first(50, task=task, layout=layout)
-    assert scenes.state.size == size
-    assert (scenes.wanted.verdict == 0).all()
 
 
 def test_no_goal_needs_more_steps_than_an_episode_has():

@@ -5,6 +5,7 @@ import torch
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
+from ifo_grounding.tasks.vocabulary import words_of
 
 
 def test_sentences_and_tokens_by_hand():
@@ -65,6 +66,24 @@ def test_a_letter_and_its_accent_are_one_word_however_they_are_written():
     vocabulary = Vocabulary.from_sentences([composed, apart], length=2)
     assert vocabulary.words == (composed,) == Vocabulary([apart], 2).words
     assert vocabulary.encode([composed, apart]).tolist() == [[1, 0], [1, 0]]
+
+
+def test_sentences_are_normalised():
+    vocabulary = Vocabulary.from_sentences(
+        ["Put it, please!", "\u201cPut it\u201d (now)"], length=4
+    )
+    assert vocabulary.words == ("it", "now", "please", "put")
+    again = vocabulary.encode([" PUT  it\nnow ... ", "put it now"])
+    assert torch.equal(again[0], again[1])
+    assert words_of("well-known c++ don't") == ["well-known", "c++", "don't"]
+
+
+def test_a_vocabulary_whose_words_keep_punctuation_keeps_it():
+    """As of recordings that were made before sentences were normalised."""
+    vocabulary = Vocabulary(["ball,", "then", "stop"], length=4)
+    assert vocabulary.encode("Ball, then stop").tolist() == [[1, 2, 3, 0]]
+    with pytest.raises(UserError, match=r"unknown word 'stop\.'"):
+        vocabulary.encode("ball, then stop.")
 
 
 @pytest.mark.parametrize("token", [-1, 3])

@@ -19,8 +19,7 @@ from ifo_grounding.networks import (
     make_policy,
     make_reward_model,
 )
-from ifo_grounding.training.pairs import select_pairs
-from ifo_grounding.transforms import GoalReward, InstructionSampler, LearnedReward, StartingPairs
+from ifo_grounding.transforms import GoalReward, InstructionSampler, LearnedReward
 from transforms.counter_world import (
     POOL,
     STOP,
@@ -109,11 +108,6 @@ def train(kind, algorithm, iterations):
 def test_ppo_learns_from_the_learned_reward_alone(kind):
     first, last = train(kind, "ppo", 12 if kind == "action" else 25)
     assert first < 0.3 and last > 0.8
-
-
-def test_reinforce_learns_from_the_learned_reward_alone():
-    first, last = train("action", "reinforce", 30)
-    assert last > first + 0.15  # three standard errors of some 80 episodes each
 
 
 @pytest.mark.parametrize("loss_class", [ClipPPOLoss, ReinforceLoss])
@@ -211,19 +205,3 @@ def test_split_and_whole_networks_choose_alike(world, networks, pool):
     index = torch.arange(len(pool)).expand(6, -1)
     logits = [one.scorer.score(one.scorer.encode(pixels), index) for one in (sampler, whole)]
     assert torch.allclose(*logits, atol=1e-4)
-
-
-def test_episodes_begin_with_selected_pairs(world, networks, pool):
-    suitability, action, _ = networks
-    pairs = select_pairs(world, suitability, pool, 20)
-    world.set_seed(0)
-    env = TransformedEnv(world, Compose(StartingPairs(pairs), LearnedReward(action)))
-    check_env_specs(env, break_when_any_done="both")
-    known = {
-        (int(scene), tuple(tokens.tolist()))
-        for scene, tokens in zip(pairs["scene"], pairs["instruction"], strict=True)
-    }
-    for _ in range(4):
-        instruction = env.reset()["instruction"]
-        for scene, tokens in zip(world.scene_numbers, instruction, strict=True):
-            assert (int(scene), tuple(tokens.tolist())) in known

@@ -112,19 +112,6 @@ def test_each_instruction_is_encoded_once_until_a_weight_changes():
     assert network.encoded == 30
 
 
-@pytest.mark.parametrize("fused", [False, True])
-def test_optimizer_steps_refresh_the_encodings(fused):
-    judge = classifier().eval()
-    scorer = PoolScorer(judge, POOL)
-    optimizer = torch.optim.Adam(judge.parameters(), lr=1.0, fused=fused)
-    before = scorer.score(scorer.encode(pixels(0)), torch.tensor([[9]])).item()
-    judge.module.sharpness.grad = torch.tensor(-1.0)
-    optimizer.step()
-    assert scorer.score(scorer.encode(pixels(0)), torch.tensor([[9]])).item() == pytest.approx(
-        before + 1, abs=1e-4
-    )
-
-
 def test_mode_is_eval_while_scoring_and_restored():
     judge = classifier()
     judge.train()
@@ -134,21 +121,6 @@ def test_mode_is_eval_while_scoring_and_restored():
     assert choose([0] * 20, judge).chosen.min() > 0
     assert modes and not any(modes)
     assert judge.training and judge.module.training and not judge.module.dropout.training
-
-
-def test_mode_is_restored_after_an_error():
-    class Broken(torch.nn.Module):
-        def forward(self, pixels, instruction):
-            raise ArithmeticError
-
-    judge = TensorDictModule(Broken(), ["pixels", "instruction"], ["suitability"]).train()
-    with pytest.raises(ArithmeticError):
-        choose([0], judge)
-    assert judge.training and judge.module.training
-
-
-def test_no_gradient_is_kept():
-    assert not choose([0], classifier()).score.requires_grad
 
 
 def test_large_batches_are_scored_in_parts():
@@ -179,17 +151,6 @@ def test_candidates_are_distinct_and_uniform():
     for place in index.T:
         assert ((place.bincount(minlength=20) - 150).abs() < 60).all()  # five standard errors
     assert draw_candidates(2, 3, 6, None).sort(1).values.tolist() == [[0, 1, 2], [0, 1, 2]]
-
-
-def test_choices_do_not_depend_on_how_many_states_are_looked_at_at_once(monkeypatch):
-    found = []
-    for at_once in (2048, 64):
-        monkeypatch.setattr("ifo_grounding.transforms.choosing.AT_ONCE", at_once)
-        choices = choose_instructions(
-            classifier(), POOL, pixels(*range(8)).repeat(25, 1, 1, 1), generator=generator(0)
-        )
-        found.append(choices.chosen)
-    assert torch.equal(*found)
 
 
 def test_no_states_no_choices():

@@ -165,16 +165,6 @@ def test_nested_keys(order):
     assert paid.any() and torch.equal(paid, rollout["action"] == STOP)
 
 
-@pytest.mark.parametrize("name", MAKERS)
-def test_a_partial_reset_inside_workers(name):
-    env = SerialEnv(2, lambda: inside(name, (3,)))
-    tensordict = env.rand_step(env.reset())["next"].exclude("reward", "learned_reward")
-    mask = torch.tensor([[0, 1, 0], [0, 0, 1]]).bool().unsqueeze(-1)
-    after = env.reset(tensordict.clone().set("_reset", mask.clone()))
-    for key in set(after.keys()) - {"done", "terminated", "truncated"}:
-        assert torch.equal(after[key][~mask[..., 0]], tensordict[key][~mask[..., 0]]), key
-
-
 def test_pairs_outside_of_workers_are_refused():
     env = TransformedEnv(SerialEnv(2, CounterWorld), pairs())
     with pytest.raises(ValueError, match="cannot reach the simulators through a SerialEnv"):

@@ -1,10 +1,9 @@
 from __future__ import annotations
 
 import pytest
-import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.world import BOX_COLOURS, COLOURS, N_KINDS, SHAPES, WorldState, kind, kind_name
+from ifo_grounding.world import BOX_COLOURS, COLOURS, N_KINDS, SHAPES, kind, kind_name
 from reference import BOXES, KINDS
 
 
@@ -26,12 +25,3 @@ def test_an_unknown_thing_has_no_number():
         kind("violet", "circle")
     with pytest.raises(UserError, match="unknown shape 'star'"):
         kind("red", "star")
-
-
-@pytest.mark.parametrize("size", [3, 6, 10])
-def test_an_empty_world_has_its_size_and_nothing_in_it(size):
-    state = WorldState.empty(4, size)
-    assert state.size == size
-    assert state.batch_size == torch.Size([4])
-    assert (state.arm.dtype, state.objects.dtype) == (torch.int64, torch.uint8)
-    assert not (state.arm.any() or state.held.any() or state.objects.any() or state.boxes.any())

@@ -104,26 +104,6 @@ def test_an_object_shows_its_colour(size):
         assert same.float().mean() > 0.08
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_what_is_held_is_seen_in_the_cell_of_the_arm(size):
-    """A held object, the same object merely under the arm, and both are three pictures."""
-    state = WorldState.empty(3)
-    state.held[0] = state.held[2] = 1
-    state.objects[1, 0] = state.objects[2, 0] = 1
-    frames = render(state, size)
-    assert len(frames.flatten(1).unique(dim=0)) == 3
-
-
-def test_any_batch_shape_can_be_drawn():
-    state = random_layout(6, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(render(state.reshape(2, 3)).flatten(0, 1), render(state))
-
-
-@pytest.mark.parametrize("size", [3, 10])
-def test_other_grids_can_be_drawn(size):
-    assert render(WorldState.empty(2, size), 16).shape == (2, 3, size * 16, size * 16)
-
-
 def test_an_unknown_tile_size_is_refused():
     assert TILE_SIZES == SIZES
     with pytest.raises(UserError, match="8, 16, 32"):

@@ -16,7 +16,6 @@ from gymnasium.vector.utils import batch_space
 
 from ifo_grounding.envs.gymnasium_shared import (
     Observation,
-    Sentences,
     act,
     check_options,
     draw_frames,
@@ -25,6 +24,7 @@ from ifo_grounding.envs.gymnasium_shared import (
     observe,
     scene_numbers,
     seed_stream,
+    sentences,
 )
 from ifo_grounding.envs.window import Window
 from ifo_grounding.errors import UserError, check_choice
@@ -74,11 +74,10 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
     ) -> None:
         check_choice("render mode", render_mode, (None, *self.metadata["render_modes"]))
         self.render_mode = render_mode
-        self.simulator = make_simulator(task, 1, tile_size, device, scene_options)
-        self.observation_space, self.action_space = make_spaces(self.simulator)
-        self._sentences = Sentences(task)
+        self._simulator = make_simulator(task, 1, tile_size, device, scene_options)
+        self.observation_space, self.action_space = make_spaces(self._simulator)
         self._text = ""
-        self._row = torch.zeros(1, dtype=torch.int64, device=self.simulator.device)
+        self._row = torch.zeros(1, dtype=torch.int64, device=self._simulator.device)
         self._window = Window(RENDER_FPS) if render_mode == "human" else None
 
     def reset(
@@ -87,17 +86,17 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         """Begin the next episode of the stream, or the first one of ``seed``."""
         super().reset(seed=seed)
         scene = check_options(options, ("scene",)).get("scene")
-        seed_stream(self.simulator, seed, self.np_random)
-        number = None if scene is None else scene_numbers(scene, 1, self.simulator.device)
-        self.simulator.reset(self._row, number)
-        self._text = self._sentences.of(self.simulator.instruction)[0]
+        seed_stream(self._simulator, seed, self.np_random)
+        number = None if scene is None else scene_numbers(scene, 1, self._simulator.device)
+        self._simulator.reset(self._row, number)
+        self._text = sentences(self._simulator.instruction)[0]
         self._show()
         return self._observe(), {TEXT: self._text}
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action, 0..5."""
         success, terminated, truncated = (
-            bool(flag[0]) for flag in act(self.simulator, np.reshape(action, (-1,)))
+            bool(flag[0]) for flag in act(self._simulator, np.reshape(action, (-1,)))
         )
         info: dict[str, Any] = {TEXT: self._text}
         if terminated or truncated:
@@ -108,7 +107,7 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
     def render(self) -> np.ndarray | None:
         """Draw the world, uint8 [H, W, 3]; in mode ``human`` show it in the window instead."""
         if self.render_mode == "rgb_array":
-            return draw_frames(self.simulator)[0]
+            return draw_frames(self._simulator)[0]
         self._show()
         return None
 
@@ -118,11 +117,11 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
             self._window.close()
 
     def _observe(self) -> Observation:
-        return {name: value[0] for name, value in observe(self.simulator).items()}
+        return {name: value[0] for name, value in observe(self._simulator).items()}
 
     def _show(self) -> None:
         if self._window is not None:
-            self._window.show(draw_frames(self.simulator)[0], self._text)
+            self._window.show(draw_frames(self._simulator)[0], self._text)
 
 
 class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
@@ -175,11 +174,10 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
             "autoreset_mode": self.autoreset_mode,
         }
         self.render_mode, self.num_envs = render_mode, num_envs
-        self.simulator = make_simulator(task, num_envs, tile_size, device, scene_options)
-        self.single_observation_space, self.single_action_space = make_spaces(self.simulator)
+        self._simulator = make_simulator(task, num_envs, tile_size, device, scene_options)
+        self.single_observation_space, self.single_action_space = make_spaces(self._simulator)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._sentences = Sentences(task)
         self._texts = np.full(num_envs, "", dtype=object)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
 
@@ -195,9 +193,9 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
                 f"options['reset_mask'] must be bool [{self.num_envs}], "
                 f"got {mask.dtype} {list(mask.shape)}"
             )
-        seed_stream(self.simulator, seed, self.np_random)
+        seed_stream(self._simulator, seed, self.np_random)
         self._begin(mask, known.get("scene"))
-        return observe(self.simulator), {TEXT: self._texts.copy(), f"_{TEXT}": mask.copy()}
+        return observe(self._simulator), {TEXT: self._texts.copy(), f"_{TEXT}": mask.copy()}
 
     def step(
         self, actions: np.ndarray
@@ -213,7 +211,7 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
             raise UserError(
                 f"{stale.sum()} worlds have ended: reset them by options['reset_mask'] first"
             )
-        success, terminated, truncated = act(self.simulator, np.asarray(actions))
+        success, terminated, truncated = act(self._simulator, np.asarray(actions))
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             success, terminated, truncated = (
                 flag & ~stale for flag in (success, terminated, truncated)
@@ -221,13 +219,13 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
             self._begin(stale)
         ended = terminated | truncated
         self._ended = ended
-        observations = observe(self.simulator)
+        observations = observe(self._simulator)
         outcome = {SUCCESS: success.copy(), f"_{SUCCESS}": ended.copy()} if ended.any() else {}
         infos: dict[str, Any] = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and outcome:
             infos = self._final(observations, ended, outcome)
             self._begin(ended)
-            for name, fresh in observe(self.simulator, np.flatnonzero(ended)).items():
+            for name, fresh in observe(self._simulator, np.flatnonzero(ended)).items():
                 observations[name][ended] = fresh
         else:
             infos = outcome
@@ -237,18 +235,18 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw each world, uint8 [H, W, 3], in mode ``rgb_array``."""
-        return tuple(draw_frames(self.simulator)) if self.render_mode == "rgb_array" else None
+        return tuple(draw_frames(self._simulator)) if self.render_mode == "rgb_array" else None
 
     def _begin(self, mask: np.ndarray, scenes: Any = None) -> None:
         """Begin new episodes where ``mask``, with the given scenes [num_envs] or the next ones."""
         if not mask.any():
             return
-        rows = torch.from_numpy(np.flatnonzero(mask)).to(self.simulator.device)
+        rows = torch.from_numpy(np.flatnonzero(mask)).to(self._simulator.device)
         numbers = None
         if scenes is not None:
-            numbers = scene_numbers(scenes, self.num_envs, self.simulator.device)[rows]
-        self.simulator.reset(rows, numbers)
-        self._texts[mask] = self._sentences.of(self.simulator.instruction[rows])
+            numbers = scene_numbers(scenes, self.num_envs, self._simulator.device)[rows]
+        self._simulator.reset(rows, numbers)
+        self._texts[mask] = sentences(self._simulator.instruction[rows])
         self._ended = self._ended & ~mask
 
     def _final(

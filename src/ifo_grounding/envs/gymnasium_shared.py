@@ -10,9 +10,8 @@ import numpy as np
 import torch
 
 from ifo_grounding import keys
-from ifo_grounding.envs.simulator import Simulator
+from ifo_grounding.envs.simulator import Simulator, check_actions
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world.tiles import TILE_SIZES
@@ -23,25 +22,9 @@ OPTIONS = sorted({f.name for f in dataclasses.fields(SceneOptions)} - {"task", "
 Observation = dict[str, np.ndarray]
 
 
-class Sentences:
-    """Reads the sentences of many token rows at once."""
-
-    def __init__(self, task: str) -> None:
-        known = grammar(task)
-        codes = self._codes(known.tokens)
-        order = np.argsort(codes)
-        self._sorted = codes[order]
-        self._sentences = np.array(known.sentences, dtype=object)[order]
-
-    def of(self, tokens: torch.Tensor) -> np.ndarray:
-        """Return the sentence of each row of tokens [N, L], object [N]."""
-        return self._sentences[np.searchsorted(self._sorted, self._codes(tokens))]
-
-    @staticmethod
-    def _codes(tokens: torch.Tensor) -> np.ndarray:
-        """View tokens [N, L], padded with zeros at the end, as N byte strings."""
-        row = np.ascontiguousarray(tokens.cpu().numpy().astype(np.uint8))
-        return row.view(f"S{row.shape[-1]}").ravel()
+def sentences(tokens: torch.Tensor) -> np.ndarray:
+    """Return the sentence of each row of tokens [N, L], object [N]."""
+    return np.array(VOCABULARY.decode(tokens.cpu()), dtype=object)
 
 
 def make_simulator(
@@ -115,17 +98,9 @@ def act(simulator: Simulator, actions: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """
     if not simulator.started:
         raise gymnasium.error.ResetNeeded("call reset() before step()")
-    if (
-        actions.shape != (simulator.num_envs,)
-        or not np.issubdtype(actions.dtype, np.integer)
-        or not ((actions >= 0) & (actions < keys.N_ACTIONS)).all()
-    ):
-        raise UserError(
-            f"actions must be integers 0..{keys.N_ACTIONS - 1}, one for each of "
-            f"{simulator.num_envs} worlds, got {actions.dtype} {list(actions.shape)}"
-        )
-    action = torch.as_tensor(actions.astype(np.int64), device=simulator.device)
-    success, terminated, truncated = simulator.step(action)
+    given = torch.from_numpy(np.ascontiguousarray(actions))
+    check_actions(given, simulator.num_envs, keys.N_ACTIONS)
+    success, terminated, truncated = simulator.step(given.to(simulator.device, torch.int64))
     return success.cpu().numpy(), terminated.cpu().numpy(), truncated.cpu().numpy()
 
 

@@ -15,9 +15,8 @@ from torchrl.envs import EnvBase
 from ifo_grounding import keys
 from ifo_grounding.envs.simulator import Simulator
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.tasks.goals import MAX_STEPS, check_task, plan
-from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.tasks.scenes import STATE_LEAVES, Scene, SceneOptions, propose_goal
+from ifo_grounding.tasks.goals import MAX_STEPS
+from ifo_grounding.tasks.scenes import STATE_LEAVES, Scene, SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import N_BOXES, N_KINDS, Layout, WorldState
 from ifo_grounding.world.tiles import TILE_SIZES
@@ -42,7 +41,7 @@ class PickAndPlaceEnv(EnvBase):
         seed: seed of the stream of scenes; random by default.
         tile_size: pixels along one side of a cell: 8, 16 or 32.
         split: ``all``, ``train`` or ``zero-shot`` instructions.
-        instructed: whether scenes come with a suitable instruction. Without, there is no
+        instructed: whether scenes come with a suitable instruction. Without, there is no goal, no
             instruction and no reward.
         expose_state: whether the true state is in the tensordict, for tools other than learners:
             adds ``("state", ...)`` entries that steps read, and ``reset(td, set_state=True)``.
@@ -55,7 +54,9 @@ class PickAndPlaceEnv(EnvBase):
     Raises:
         UserError: on an unknown name or an impossible size.
 
-    A reset tensordict may hold ``"scene"``, int64 [*B, 1]: the numbers of the scenes to begin with.
+    A reset tensordict may hold ``"scene"``, int64 [*B, 1], the numbers of the scenes to begin with,
+    and beside it, where it holds no ``"pixels"``, an ``"instruction"`` of the task, int64 [*B, 16],
+    to follow there in place of the scene's own. One that does not suit its scene is never rewarded.
 
     >>> env = PickAndPlaceEnv("pick-out", num_envs=4, seed=0)
     >>> rollout = env.rollout(40, break_when_any_done=False)
@@ -67,6 +68,8 @@ class PickAndPlaceEnv(EnvBase):
     """The action by which a policy ends an episode."""
     steps_on = True
     """A world may be stepped after an end, as if there had been none."""
+    vocabulary = VOCABULARY
+    """Words of the instructions."""
 
     def __init__(
         self,
@@ -103,7 +106,7 @@ class PickAndPlaceEnv(EnvBase):
         self._supports_set_state = expose_state
         self.vocabulary_size, self.instruction_length = len(VOCABULARY), VOCABULARY.length
         seed = secrets.randbits(31) if seed is None else seed
-        self.simulator = Simulator(self.options, num_envs, seed, tile_size, self.device)
+        self._simulator = Simulator(self.options, num_envs, seed, tile_size, self.device)
         self._shown = [keys.PIXELS, keys.INSTRUCTION] if instructed else [keys.PIXELS]
         self._make_specs()
 
@@ -115,12 +118,25 @@ class PickAndPlaceEnv(EnvBase):
     @property
     def scene_numbers(self) -> Tensor:
         """Number of the scene that each row began with, int64 [num_envs]; -1 where it has none."""
-        return self.simulator.numbers
+        return self._simulator.numbers
+
+    @property
+    def truth(self) -> Scene:
+        """The worlds as they are and what they are asked, [num_envs]; clone what is to be kept.
+
+        For evaluation only.
+
+        Raises:
+            UserError: where ``instructed=False``, as a learner's environment is.
+        """
+        if not self.instructed:
+            raise UserError("an environment with instructed=False keeps its true state to itself")
+        return self._simulator.scene
 
     def to(self, device: torch.device | str) -> PickAndPlaceEnv:
         """Move the worlds, with the episodes that run in them, to a device."""
         super().to(device)
-        self.simulator.to(self.device)
+        self._simulator.to(self.device)
         return self
 
     def _make_specs(self) -> None:
@@ -168,19 +184,27 @@ class PickAndPlaceEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None or not self.simulator.started:
+        if mask is None or not self._simulator.started:
             rows = torch.arange(self.num_envs, device=self.device)
         else:
             rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
+        given = self._empty() if tensordict is None else tensordict
+        tokens = given.get(keys.INSTRUCTION, None) if self.instructed else None
         if kwargs.get("set_state"):
-            if tensordict is None or STATE not in tensordict:
+            if STATE not in given:
                 raise UserError("reset(set_state=True) needs a tensordict with a state")
-            self.simulator.place(rows, self._given_scene(tensordict)[rows])
+            if tokens is None and self.instructed:
+                raise UserError("reset(set_state=True) needs an instruction beside the state")
+            self._simulator.place(rows, Scene.unasked(self._world(given[STATE])[rows]))
         else:
-            numbers = None if tensordict is None else tensordict.get(keys.SCENE, None)
+            numbers = given.get(keys.SCENE, None)
             if numbers is not None:
                 numbers = numbers.reshape(self.num_envs)[rows]
-            self.simulator.reset(rows, numbers)
+            self._simulator.reset(rows, numbers)
+            if numbers is None or keys.PIXELS in given:  # an observation, whose instruction is over
+                tokens = None
+        if tokens is not None:
+            self._simulator.ask(rows, tokens[rows])
         result = self._observe()
         for name in DONE:
             result[name] = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
@@ -213,8 +237,10 @@ class PickAndPlaceEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
-            self.simulator.state = self._world(given)
-        success, terminated, truncated = self.simulator.step(tensordict.get(keys.ACTION))
+            self._simulator.state = self._world(given)
+        if self.instructed:
+            self._check_instruction(tensordict.get(keys.INSTRUCTION, None))
+        success, terminated, truncated = self._simulator.step(tensordict.get(keys.ACTION))
         result = self._observe()
         result[keys.REWARD] = success.float().unsqueeze(-1)
         result["done"] = (terminated | truncated).unsqueeze(-1)
@@ -222,13 +248,27 @@ class PickAndPlaceEnv(EnvBase):
         result["truncated"] = truncated.unsqueeze(-1)
         return result
 
+    def _check_instruction(self, given: Tensor | None) -> None:
+        """Refuse another instruction than the episode's; on a GPU that would wait for it."""
+        if given is None or given.device.type != "cpu":
+            return
+        asked = self._simulator.instruction
+        if given.shape != asked.shape or bool((given != asked).any()):
+            raise UserError(
+                "the instruction is another than the episode began with: give it to reset(), in a "
+                "TensorDict of 'scene' (env.scene_numbers for the same scenes) and 'instruction'"
+            )
+
+    def _empty(self) -> TensorDict:
+        return TensorDict({}, batch_size=self.batch_size, device=self.device)
+
     def _observe(self) -> TensorDict:
-        result = TensorDict({}, batch_size=self.batch_size, device=self.device)
-        result[keys.PIXELS] = self.simulator.pixels()
+        result = self._empty()
+        result[keys.PIXELS] = self._simulator.pixels()
         if self.instructed:
-            result[keys.INSTRUCTION] = self.simulator.instruction.clone()
+            result[keys.INSTRUCTION] = self._simulator.instruction.clone()
         if self.expose_state:
-            state = self.simulator.state
+            state = self._simulator.state
             leaves = {leaf: getattr(state, leaf).clone() for leaf in STATE_LEAVES}
             result[STATE] = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
         return result
@@ -238,24 +278,9 @@ class PickAndPlaceEnv(EnvBase):
             **{leaf: given[leaf] for leaf in STATE_LEAVES}, batch_size=self.batch_size
         )
 
-    def _given_scene(self, tensordict: TensorDictBase) -> Scene:
-        """Make scenes of given states, and of the instructions beside them."""
-        state = self._world(tensordict[STATE])
-        tokens = tensordict.get(keys.INSTRUCTION, None)
-        if not self.instructed:
-            shape = (self.num_envs, self.instruction_length)
-            tokens = torch.zeros(shape, dtype=torch.int64, device=self.device)
-            goal = propose_goal(state.cpu(), check_task(self.task), torch.Generator())
-        elif tokens is None:
-            raise UserError("reset(set_state=True) needs an instruction beside the state")
-        else:
-            goal = grammar(self.task).parse_tokens(tokens)
-        wanted = plan(state, goal.to(self.device), self.options.max_steps)
-        return Scene(state=state, wanted=wanted, instruction=tokens, batch_size=self.batch_size)
-
     def _set_seed(self, seed: int | None) -> None:
-        self.simulator.seed(secrets.randbits(31) if seed is None else seed)
+        self._simulator.seed(secrets.randbits(31) if seed is None else seed)
 
     def render(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
         """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
-        return self.simulator.pixels(tile_size=tile_size).permute(0, 2, 3, 1).cpu().numpy()
+        return self._simulator.pixels(tile_size=tile_size).permute(0, 2, 3, 1).cpu().numpy()

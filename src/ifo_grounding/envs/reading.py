@@ -18,16 +18,7 @@ CHANNELS = (1, 3, 4)
 
 
 class Reading:
-    """Reads image and instruction out of what a world shows.
-
-    Args:
-        vocabulary: the words of instructions.
-        image: name of the image, None where the observation is the image.
-        instruction: name of the sentence.
-        instructed: whether instructions are read at all.
-        stop: the action that ends an episode, ``"add"`` for one more, None where the world has one.
-        skip_unknown: whether unknown words of an instruction are left out.
-    """
+    """Reads image and instruction out of what a world shows; arguments are `from_gymnasium`'s."""
 
     def __init__(
         self,
@@ -139,7 +130,7 @@ class Read(gymnasium.Wrapper):
         return self._last, {}
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Take an action; the instruction is that of the episode's beginning."""
+        """Take an action; the instruction is the one read at the reset."""
         if self._last is None:
             raise UserError("there is no episode yet: reset the environment first")
         if self._last[ENDED].any():

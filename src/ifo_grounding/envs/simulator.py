@@ -7,7 +7,8 @@ from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.tasks.goals import Plan, fulfilled
+from ifo_grounding.tasks.goals import Plan, fulfilled, plan
+from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import (
     Scene,
     SceneOptions,
@@ -104,10 +105,8 @@ class Simulator:
         self.device = device
         self.steps, self.numbers = self.steps.to(self.device), self.numbers.to(self.device)
         if self._episodes is not None:
-            state, wanted, tokens = self.state, self.wanted, self.instruction
-            self._episodes = _Episodes(
-                state.to(self.device), wanted.to(self.device), tokens.to(self.device)
-            )
+            scene = self.scene.to(self.device)
+            self._episodes = _Episodes(scene.state, scene.wanted, scene.instruction)
         self._prepare()
         self.stream = SceneStream(self.options, self.stream.seed, self.device)
         return self
@@ -130,9 +129,11 @@ class Simulator:
         self._touched = None
 
     @property
-    def wanted(self) -> Plan:
-        """The goals, resolved in the states in which the episodes began, [num_envs]."""
-        return self._running.wanted
+    def scene(self) -> Scene:
+        """The worlds as they are, with what they are asked, [num_envs]."""
+        now = self._running
+        parts = {"state": now.state, "wanted": now.wanted, "instruction": now.instruction}
+        return Scene(**parts, batch_size=[self.num_envs])
 
     @property
     def instruction(self) -> Tensor:
@@ -178,6 +179,18 @@ class Simulator:
         self._begin(rows)
         self.numbers = self.numbers.index_fill(0, rows, -1)
 
+    @torch.inference_mode(False)
+    def ask(self, rows: Tensor, tokens: Tensor) -> None:
+        """Ask some rows, int64 [R], which have just begun, for sentences of the task [R, 16].
+
+        Raises:
+            UserError: where a sentence is none of the task's.
+        """
+        goal = grammar(self.options.task).parse_tokens(tokens)
+        wanted = plan(self.state[rows], goal, self.options.max_steps)
+        for leaf, new in zip(self._running.asked, [*plan_leaves(wanted), tokens], strict=True):
+            leaf.index_copy_(0, rows, new.to(leaf))
+
     def _begin(self, rows: Tensor) -> None:
         self.steps[rows] = 0
         self._touch(rows, self._every_cell.expand(len(rows), -1))
@@ -195,7 +208,7 @@ class Simulator:
         """Apply one action, int64 [num_envs], to each row.
 
         Returns:
-            Success, terminated and truncated, bool [num_envs] each. Success is judged when an
+            Success, terminated and truncated, bool [num_envs] each. Success is told when an
             episode ends, and always false where there are no instructions.
 
         Raises:
@@ -213,7 +226,7 @@ class Simulator:
         ended = terminated | truncated
         if not self.options.instructed:
             return torch.zeros_like(ended), terminated, truncated
-        return ended & fulfilled(state, self.wanted), terminated, truncated
+        return ended & fulfilled(state, self._running.wanted), terminated, truncated
 
     @torch.inference_mode(False)
     def pixels(self, rows: Tensor | None = None, tile_size: int | None = None) -> Tensor:
@@ -231,7 +244,7 @@ class _Episodes:
 
     def __init__(self, state: WorldState, wanted: Plan, instruction: Tensor) -> None:
         self.state, self.wanted, self.instruction = state, wanted, instruction
-        self._asked = [*plan_leaves(wanted), instruction]  # written to, and never replaced
+        self.asked = [*plan_leaves(wanted), instruction]  # written to, and never replaced
 
     def __getstate__(self) -> tuple[WorldState, Plan, Tensor]:
         """Return what a copy is made of. Left alone, deepcopy shares the tensors of a state."""
@@ -243,4 +256,4 @@ class _Episodes:
 
     def leaves(self) -> list[Tensor]:
         """Everything that episodes are made of, as of scenes."""
-        return [*state_leaves(self.state), *self._asked]
+        return [*state_leaves(self.state), *self.asked]

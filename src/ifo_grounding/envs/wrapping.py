@@ -130,17 +130,7 @@ def world_seed(seed: int, stream: str, number: int) -> int:
 
 
 class GymnasiumEnv(EnvBase):
-    """What :func:`from_gymnasium` returns.
-
-    Args:
-        make: makes one world.
-        reading: how to read it.
-        num_envs: worlds side by side.
-        processes: whether each runs in a process of its own.
-        seed: of the stream of scenes.
-        stream: name of the stream.
-        device: where tensors go.
-    """
+    """What :func:`from_gymnasium` returns: worlds that ``make`` makes and ``reading`` reads."""
 
     steps_on = True
     """A row may be stepped after its end, to no effect."""

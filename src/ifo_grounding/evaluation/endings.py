@@ -124,7 +124,7 @@ def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
 def _play(player: Player, env: EnvBase, start: TensorDictBase) -> tuple[Tensor, ...]:
     """Return how episodes ended, what was wanted and mistaken, and what was done."""
     assert isinstance(env, PickAndPlaceEnv)
-    first, wanted = env.simulator.state.clone(), env.simulator.wanted.clone()
+    first, wanted = env.truth.state.clone(), env.truth.wanted.clone()
     goal = grammar(env.task).parse_tokens(start[keys.INSTRUCTION])
     last = first.clone()
     shape = (env.num_envs, env.options.max_steps)
@@ -132,7 +132,7 @@ def _play(player: Player, env: EnvBase, start: TensorDictBase) -> tuple[Tensor, 
     taken = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
 
     def keep(rows: Tensor, transition: TensorDictBase) -> None:
-        last[rows] = env.simulator.state[rows]
+        last[rows] = env.truth.state[rows]
         actions[rows, taken[rows]] = transition[keys.ACTION].to(torch.int8)
         taken[rows] += 1
 

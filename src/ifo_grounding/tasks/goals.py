@@ -81,7 +81,7 @@ class Plan(TensorClass):
 
 
 def plan(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Plan:
-    """Resolve what a goal refers to in an initial state, and judge it."""
+    """Resolve what a goal refers to in an initial state, and say whether it suits."""
     is_object = _shows(state.objects, goal.object)
     if (from_box := goal.task == PICK_OUT).any():
         is_object = is_object & (~from_box.unsqueeze(-1) | _shows(state.boxes, goal.source))

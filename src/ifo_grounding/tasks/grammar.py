@@ -20,7 +20,7 @@ from ifo_grounding.tasks.goals import (
     Goal,
     check_task,
 )
-from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.tasks.vocabulary import VOCABULARY, words_of
 from ifo_grounding.world import BOX_COLOURS, N_BOXES, N_KINDS, kind, kind_name
 
 SIDE_WORDS = {
@@ -29,6 +29,7 @@ SIDE_WORDS = {
     "below": "below",
     "left": "to the left of",
 }
+PUTS = ("put", "place", "drop")
 FIELDS = ("object", "reference", "source", "target", "side")
 
 
@@ -40,11 +41,11 @@ def _phrasings(task: str) -> tuple[str, ...]:
     if task == "pick":
         direct = [
             f"{verb} the {{object}} {into} the {{target}} box"
-            for verb, into in itertools.product(("put", "place", "drop"), ("in", "into"))
+            for verb, into in itertools.product(PUTS, ("in", "into"))
         ]
         staged = [
             f"pick up the {{object}} and {verb} it {into} the {{target}} box"
-            for verb, into in itertools.product(("put", "place", "drop"), ("in", "into"))
+            for verb, into in itertools.product(PUTS, ("in", "into"))
         ]
         return (*direct, *staged)
     if task == "pick-out":
@@ -53,28 +54,20 @@ def _phrasings(task: str) -> tuple[str, ...]:
             f"{verb} the {{object}} from the {{source}} box {into} the {{target}} box"
             for verb, into in itertools.product(verbs, ("to", "into", "inside"))
         ]
-        return (*direct, *_staged(("put it into", "place it in", "drop it in")))
-    direct = [f"{verb} the {{object}} {{side}} the {{reference}}" for verb in _PUTS]
-    staged = [f"pick up the {{object}} and {verb} it {{side}} the {{reference}}" for verb in _PUTS]
+        staged = [
+            f"{take} the {{object}} {'from' if take == 'remove' else 'out of'} the {{source}} box "
+            f"and {put} the {{target}} box"
+            for take, put in itertools.product(
+                ("take", "get", "pick", "lift", "pull", "remove"),
+                ("put it into", "place it in", "drop it in"),
+            )
+        ]
+        return (*direct, *staged)
+    direct = [f"{verb} the {{object}} {{side}} the {{reference}}" for verb in PUTS]
+    staged = [f"pick up the {{object}} and {verb} it {{side}} the {{reference}}" for verb in PUTS]
     return (*direct, *staged)
 
 
-def _staged(puts: tuple[str, ...]) -> list[str]:
-    """Return the wordings of pick-out that say both steps."""
-    takes = ("take", "get", "pick", "lift", "pull", "remove")
-    return [
-        f"{take} the {{object}} {'from' if take == 'remove' else 'out of'} the {{source}} box "
-        f"and {put} the {{target}} box"
-        for take, put in itertools.product(takes, puts)
-    ]
-
-
-def _unsaid_phrasings(task: int) -> list[str]:
-    """Return the wordings that nobody says, made of the words of those that are said."""
-    return _staged(("put it in", "place it into", "drop it into")) if task == PICK_OUT else []
-
-
-_PUTS = ("put", "place", "drop")
 PHRASINGS = {task: _phrasings(task) for task in TASKS}
 """Wordings of each task; a udlr task has each of them for each side."""
 N_TEMPLATES = {
@@ -130,23 +123,23 @@ class Grammar:
         self.phrasings = PHRASINGS[task]
         fields = list(_fillers(self.task))
         table = torch.tensor(fields)
-        self.sentences, self.goals = self._spelled_out(fields, self.phrasings)
-        """Every sentence, and the goal of each, [S]."""
+        self.sentences = tuple(
+            _fill(phrasing, row) for row in fields for phrasing in self.phrasings
+        )
+        """Every sentence, goal by goal in all wordings."""
+        columns = table.repeat_interleave(len(self.phrasings), 0).unbind(-1)
+        task_column = torch.full_like(columns[0], self.task)
+        self.goals = Goal(
+            task=task_column,
+            **dict(zip(FIELDS, columns, strict=True)),
+            batch_size=task_column.shape,
+        )
+        """The goal of each sentence, [S]."""
         self.tokens = VOCABULARY.encode(self.sentences)
         """Token ids of every sentence, int64 [S, 16]."""
         self._by_sentence = {sentence: row for row, sentence in enumerate(self.sentences)}
         self._goal_rows = torch.full((N_KINDS + 1, N_KINDS + 1, N_BOXES + 1, N_BOXES + 1, 4), -1)
         self._goal_rows[tuple(table.unbind(-1))] = torch.arange(len(fields))
-
-    def _spelled_out(
-        self, fields: list[tuple[int, ...]], phrasings: tuple[str, ...]
-    ) -> tuple[tuple[str, ...], Goal]:
-        """Return the sentences of goals in all wordings, goal by goal, and the goal of each."""
-        sentences = tuple(_fill(phrasing, row) for row in fields for phrasing in phrasings)
-        table = torch.tensor(fields).repeat_interleave(len(phrasings), 0)
-        columns = dict(zip(FIELDS, table.unbind(-1), strict=True))
-        task = torch.full_like(columns["object"], self.task)
-        return sentences, Goal(task=task, **columns, batch_size=task.shape)
 
     def encode(self, goal: Goal, phrasing: Tensor) -> Tensor:
         """Return the tokens of goals [*B] in the given wordings [*B], int64 [*B, 16]."""
@@ -164,38 +157,23 @@ class Grammar:
     def parse(self, sentences: str | list[str]) -> Goal:
         """Return the goal of each sentence, [N].
 
-        Sentences that exchange words of this task's are read, too: other wordings, and what makes
-        no sense, such as from a box into the same box, whose goal suits no state.
-
         Raises:
             UserError: where a sentence is none of this task's.
         """
         if isinstance(sentences, str):
             sentences = [sentences]
-        wanted = [" ".join(sentence.lower().split()) for sentence in sentences]
-        rows, goals = self._by_sentence, self.goals
-        if not rows.keys() >= set(wanted):
-            rows, goals = self._readable
-        for given, sentence in zip(sentences, wanted, strict=True):
-            if sentence not in rows:
-                raise UserError(
-                    f"{given!r} is no sentence of {TASKS[self.task]}; "
-                    f"it says such as {self.sentences[0]!r}"
-                )
-        return goals[torch.tensor([rows[sentence] for sentence in wanted], dtype=torch.int64)]
+        rows = [self._by_sentence.get(" ".join(words_of(sentence))) for sentence in sentences]
+        if None in rows:
+            raise UserError(
+                f"{sentences[rows.index(None)]!r} is no sentence of {TASKS[self.task]}; "
+                f"it says such as {self.sentences[0]!r}"
+            )
+        return self.goals[torch.tensor(rows, dtype=torch.int64)]
 
     def parse_tokens(self, tokens: Tensor) -> Goal:
         """Return the goal of each row of token ids [N, 16], [N] on the tokens' device."""
         distinct, inverse = tokens.cpu().unique(dim=0, return_inverse=True)
         return self.parse(VOCABULARY.decode(distinct))[inverse].to(tokens.device)
-
-    @functools.cached_property
-    def _readable(self) -> tuple[dict[str, int], Goal]:
-        """Rows of all sentences that are read, be they said or not, and the goal of each, [R]."""
-        phrasings = (*self.phrasings, *_unsaid_phrasings(self.task))
-        fields = [*_fillers(self.task), *_senseless_fillers(self.task)]
-        sentences, goals = self._spelled_out(fields, phrasings)
-        return {sentence: row for row, sentence in enumerate(sentences)}, goals
 
 
 @functools.cache
@@ -220,15 +198,6 @@ def _fillers(task: int) -> Iterator[tuple[int, ...]]:
             yield from ((item, other, 0, 0, side) for other in others for side in sides)
         else:
             yield (item, 0, 0, 0, 0)
-
-
-def _senseless_fillers(task: int) -> Iterator[tuple[int, ...]]:
-    """Yield the fields of what names one thing in two roles: no goal, yet words in their places."""
-    for item in range(1, N_KINDS + 1):
-        if task == PICK_OUT:
-            yield from ((item, 0, box, box, 0) for box in range(1, N_BOXES + 1))
-        elif task == PICK_UDLR:
-            yield from ((item, item, 0, 0, side) for side in range(len(SIDES)))
 
 
 def _fill(phrasing: str, fields: tuple[int, ...]) -> str:

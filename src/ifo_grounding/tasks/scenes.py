@@ -24,6 +24,7 @@ from ifo_grounding.tasks.goals import (
     plan,
 )
 from ifo_grounding.tasks.grammar import SPLITS, grammar, holdout_kinds, in_split
+from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import Layout, WorldState, random_layout
 
 CHUNK = 1024
@@ -45,6 +46,22 @@ class Scene(TensorClass):
     """The goal resolved in it, [*B]."""
     instruction: Tensor
     """Tokens of a sentence for the goal, int64 [*B, 16]."""
+
+    @classmethod
+    def unasked(cls, state: WorldState) -> Scene:
+        """Return scenes [N] in which nothing is asked: a plan and words of zeros."""
+        nothing = torch.zeros_like(state.arm)
+        wanted = Plan(
+            verdict=nothing.clone(),
+            object_cell=nothing.clone(),
+            destination=nothing.clone(),
+            carries=nothing.bool(),
+            objects=torch.zeros_like(state.objects),
+            steps=nothing.clone(),
+            batch_size=state.batch_size,
+        )
+        words = nothing.new_zeros(*state.batch_size, VOCABULARY.length)
+        return cls(state=state, wanted=wanted, instruction=words, batch_size=state.batch_size)
 
 
 @dataclass(frozen=True)
@@ -119,7 +136,8 @@ def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
         owners.append(unfinished[owner])
         if not missing.any():
             order = torch.cat(owners).argsort(stable=True)
-            return _said(_chosen(proposed, torch.cat(rows)[order]), options.task)
+            found = _chosen(proposed, torch.cat(rows)[order])
+            return _said(found, options.task) if options.instructed else Scene.unasked(found.state)
         if len(proposed) == ROUNDS_HELD:
             proposed = [_chosen(proposed, torch.cat(rows))]
             rows = [torch.arange(len(proposed[0].wording))]
@@ -189,13 +207,10 @@ def _chosen(proposed: list[_Proposal], rows: Tensor) -> _Proposal:
 
 
 def _said(proposal: _Proposal, task: str) -> Scene:
-    """Return scenes with a sentence for each suitable goal."""
+    """Return scenes with a sentence for each goal."""
     state, wanted, goal, wording = proposal
-    sentences, n = grammar(task), len(wording)
-    said = torch.zeros(n, sentences.tokens.shape[-1], dtype=torch.int64)
-    asked = (wanted.verdict == SUITABLE).nonzero().squeeze(-1)
-    said[asked] = sentences.encode(goal[asked], wording[asked])
-    return Scene(state=state, wanted=wanted, instruction=said, batch_size=[n])
+    said = grammar(task).encode(goal, wording)
+    return Scene(state=state, wanted=wanted, instruction=said, batch_size=[len(wording)])
 
 
 def _integers(high: int, n: int, source: Generators) -> Tensor:

@@ -17,19 +17,25 @@ PAD = 0
 class Vocabulary:
     """Two-way table of words and token ids; id 0 pads.
 
+    Sentences are normalised by :func:`words_of` before their words are looked up, unless the
+    vocabulary's own words keep punctuation that this takes away: such a vocabulary, of recordings
+    that were made so, splits sentences at spaces only.
+
     Args:
         words: distinct lower-case words; the first gets id 1.
         length: tokens per instruction, padding included.
 
     >>> vocabulary = Vocabulary(["move", "to", "the", "red", "circle"], length=6)
-    >>> tokens = vocabulary.encode(["Move to the red circle"])
+    >>> tokens = vocabulary.encode(["Move to the red circle!"])
     >>> tokens.tolist(), vocabulary.decode(tokens)
     ([[1, 2, 3, 4, 5, 0]], ['move to the red circle'])
     """
 
     def __init__(self, words: Sequence[str], length: int = INSTRUCTION_LENGTH) -> None:
-        self.words = tuple(map(_composed, words))
+        self.words = tuple(unicodedata.normalize("NFC", word) for word in words)
         self.length = length
+        self.punctuation = any(words_of(word) != [word] for word in self.words)
+        """Whether words keep the punctuation around them."""
         self._ids = {word: number for number, word in enumerate(self.words, start=1)}
         if len(self._ids) != len(self.words):
             raise UserError("a vocabulary must not hold a word twice")
@@ -41,7 +47,7 @@ class Vocabulary:
         cls, sentences: Iterable[str], length: int = INSTRUCTION_LENGTH
     ) -> Vocabulary:
         """Collect the distinct words of sentences, in alphabetical order."""
-        return cls(sorted({word for s in sentences for word in _words(s)}), length)
+        return cls(sorted({word for s in sentences for word in words_of(s)}), length)
 
     def __len__(self) -> int:
         """Count the token ids, padding included."""
@@ -71,7 +77,7 @@ class Vocabulary:
             sentences = [sentences]
         tokens = torch.full((len(sentences), self.length), PAD, dtype=torch.int64)
         for row, sentence in enumerate(sentences):
-            words = _words(sentence)
+            words = words_of(sentence, self.punctuation)
             if skip_unknown:
                 words = [word for word in words if word in self._ids]
             ids = [self._id(word, sentence) for word in words]
@@ -108,13 +114,27 @@ class Vocabulary:
         return self._ids[word]
 
 
-def _composed(text: str) -> str:
-    """Write a letter and its accent as one: both ways of writing them are one word."""
-    return unicodedata.normalize("NFC", text)
+def words_of(sentence: str, punctuation: bool = False) -> list[str]:
+    """Return the words of a sentence: lower case, without the punctuation around them.
+
+    Punctuation inside of words stays, what is punctuation alone is left out, and a letter and its
+    accent are one character (NFC), however they were written.
+
+    Args:
+        sentence: any text.
+        punctuation: whether the punctuation around words stays, too.
+
+    >>> words_of("  Pick-up Ann's RED ball, then stop ...")
+    ['pick-up', "ann's", 'red', 'ball', 'then', 'stop']
+    """
+    words = unicodedata.normalize("NFC", sentence).lower().split()
+    if punctuation:
+        return words
+    return [bare for word in words if (bare := word.strip("".join(filter(_is_mark, word))))]
 
 
-def _words(sentence: str) -> list[str]:
-    return _composed(sentence).lower().split()
+def _is_mark(character: str) -> bool:
+    return unicodedata.category(character).startswith("P")
 
 
 WORDS = (

@@ -46,7 +46,7 @@ class EpisodeTransform(Transform):
             f"{len(names)}: {names}"
         )
 
-    def beginning(self, tensordict: TensorDictBase | None, rows: int) -> Tensor:
+    def new_rows(self, tensordict: TensorDictBase | None, rows: int) -> Tensor:
         """Numbers of the rows that begin an episode, int64 [R], of ``rows`` rows."""
         mask = None if tensordict is None else tensordict.get(self.reset_key, None)
         if mask is None:
@@ -62,10 +62,9 @@ class EpisodeTransform(Transform):
 class InstructionTransform(EpisodeTransform):
     """A transform that writes an instruction at the reset and carries it to the episode's end.
 
-    Subclasses set ``vocabulary_size``, and write ``out_keys[0]`` in ``_reset``.
+    Subclasses write ``out_keys[0]`` in ``_reset``. Its spec has as many token ids as the
+    environment declares in ``vocabulary_size``, or else as the instructions need.
     """
-
-    vocabulary_size: int | None
 
     @property
     def tokens(self) -> Tensor:
@@ -87,17 +86,16 @@ class InstructionTransform(EpisodeTransform):
         return next_tensordict.set(self.out_keys[0], instruction)
 
     def _spec(self, like: Composite) -> Bounded:
-        size, largest = self.vocabulary_size, int(self.tokens.max())
-        if size is None and self.container is not None:
-            size = attribute(self.container, "vocabulary_size")
-        if size is not None and largest >= size:
+        largest = int(self.tokens.max())
+        size = attribute(self.container, "vocabulary_size", largest + 1)
+        if largest >= size:
             raise UserError(
-                f"there is a token id {largest}, but the vocabulary has {size} ids: pass the "
-                "vocabulary_size that made the instructions"
+                f"there is a token id {largest}, but the environment's vocabulary has {size} ids: "
+                "encode instructions with its vocabulary"
             )
         return Bounded(
             0,
-            largest if size is None else size - 1,
+            size - 1,
             shape=(*like.shape, self.tokens.shape[1]),
             dtype=torch.int64,
             device=like.device,

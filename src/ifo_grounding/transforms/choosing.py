@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, unravel_key
@@ -19,6 +19,8 @@ from ifo_grounding.transforms._common import flat_logit
 CHOICES = ("random", "best")
 AT_ONCE = 2048
 """States, instructions or pairs that pass a network together, to bound memory."""
+PARTS = ("encode_scenes", "encode_instruction", "score_candidates")
+"""Methods of a network that encodes states and instructions separately."""
 FIRST_LOOK = 4
 """Candidates of each state that are scored first; then twice as many, and so on."""
 
@@ -30,24 +32,6 @@ class Choices(NamedTuple):
     """Index into the pool, int64 [B]; -1 where no candidate was above the threshold."""
     score: Tensor
     """Its probability of being suitable, float32 [B]; the best one seen where there is none."""
-
-
-class Scenes(Protocol):
-    """Encoded states, of which rows can be taken: a tensor, for example."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, rows: Any) -> Any: ...
-
-
-class SplitClassifier(Protocol):
-    """A classifier that encodes states and instructions separately."""
-
-    def encode_scenes(self, *pixels: Tensor) -> Scenes: ...  # noqa: D102
-
-    def encode_instruction(self, instruction: Tensor) -> Tensor: ...  # noqa: D102
-
-    def score_candidates(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor: ...  # noqa: D102
 
 
 class PoolScorer:
@@ -82,16 +66,14 @@ class PoolScorer:
         self._weights: list[Tensor] = []
 
     @property
-    def network(self) -> SplitClassifier | None:
+    def network(self) -> Any | None:
         """The classifier's network where it encodes states and instructions separately."""
         if not isinstance(self.classifier, TensorDictModule):
             return None
         network = self.classifier.module
-        parts = ("encode_scenes", "encode_instruction", "score_candidates")
-        split = all(callable(getattr(network, part, None)) for part in parts)
-        return cast(SplitClassifier, network) if split else None
+        return network if all(callable(getattr(network, part, None)) for part in PARTS) else None
 
-    def encode(self, pixels: Tensor) -> Scenes:
+    def encode(self, pixels: Tensor) -> Any:
         """Encode states [B, ...] for :meth:`score`, or return them where nothing is split."""
         device = device_of(self.classifier) or pixels.device
         if (network := self.network) is None:
@@ -99,7 +81,7 @@ class PoolScorer:
         with evaluating(self.classifier):
             return network.encode_scenes(pixels.to(device))
 
-    def score(self, states: Scenes, index: Tensor) -> Tensor:
+    def score(self, states: Any, index: Tensor) -> Tensor:
         """Score candidates.
 
         Args:
@@ -134,7 +116,7 @@ class PoolScorer:
             logit = self.classifier(pairs).get(self.logit_key)
         return flat_logit(logit, index.numel(), self.logit_key).view(index.shape)
 
-    def encodings(self, network: SplitClassifier, device: torch.device) -> Tensor:
+    def encodings(self, network: Any, device: torch.device) -> Tensor:
         """Encode the pool, or return what was kept if no weight has changed since."""
         weights = [*self.classifier.parameters(), *self.classifier.buffers()]
         # Values are compared, not version counters: updates through `.data` or from another

@@ -1,4 +1,4 @@
-"""An instruction for every episode, chosen by a learned judge of suitability."""
+"""An instruction for every episode, chosen by a learned classifier of suitability."""
 
 from __future__ import annotations
 
@@ -54,8 +54,6 @@ class InstructionSampler(InstructionTransform):
         seed: seed of the choices.
         in_keys: key of the image.
         out_keys: key of the instruction.
-        vocabulary_size: number of token ids, for the spec; by default that of the environment, or
-            else one more than the largest id of the pool.
 
     Raises:
         UserError: on an option or a pool of another form, on an environment that exposes its true
@@ -88,14 +86,13 @@ class InstructionSampler(InstructionTransform):
         seed: int = 0,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
-        vocabulary_size: int | None = None,
     ) -> None:
         super().__init__(in_keys=in_keys or [PIXELS], out_keys=out_keys or [INSTRUCTION])
         check_options(threshold, candidates, choose)
         max_tries = at_least_one("max_tries", max_tries)
         self.threshold, self.candidates, self.choose = threshold, candidates, choose
         self._hopeful = False  # whether any state has ever been served
-        self.max_tries, self.vocabulary_size = max_tries, vocabulary_size
+        self.max_tries = max_tries
         distinct = check_pool(pool).unique(dim=0)
         self.scorer = PoolScorer(classifier, distinct, self.in_keys[0])
         self.classifier = classifier
@@ -145,10 +142,7 @@ class InstructionSampler(InstructionTransform):
         self._score_sum = 0.0
 
     def _choose(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        if self.scorer.classifier is not self.classifier:  # another one was put there
-            scored = self.scorer.scored
-            self.scorer = PoolScorer(self.classifier, self.scorer.pool, self.in_keys[0])
-            self.scorer.scored = scored
+        self.scorer.classifier = self.classifier  # another one may have been put there
         index, score = choose_instructions(
             self.scorer,
             None,
@@ -169,7 +163,7 @@ class InstructionSampler(InstructionTransform):
     ) -> TensorDictBase:
         batch = tensordict_reset.batch_size
         rows = batch.numel()
-        waiting = self.beginning(tensordict, rows)
+        waiting = self.new_rows(tensordict, rows)
         pixels = tensordict_reset.get(self.in_keys[0])
         instruction = self.pool.new_zeros(rows, self.pool.shape[1], device=pixels.device)
         best_score, attempt = 0.0, 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
@@ -33,10 +35,8 @@ class StartingPairs(InstructionTransform):
         pairs: TensorDict [N] with ``scene`` int64 [N, 1] and ``instruction`` int64 [N, L]. With
             ``frame_hash`` int64 [N, 1], every scene is checked to be the one that was stored.
         seed: seed of the order.
-        instruction_key: key of the instruction in the environment.
-        pixels_key: key of the image.
-        vocabulary_size: number of token ids, for the spec; by default that of the environment, or
-            else one more than the largest id of the pairs.
+        in_keys: key of the image.
+        out_keys: key of the instruction in the environment.
 
     Raises:
         UserError: on pairs of another form; on an environment that exposes its true state, has an
@@ -59,13 +59,11 @@ class StartingPairs(InstructionTransform):
         self,
         pairs: TensorDictBase,
         seed: int = 0,
-        instruction_key: NestedKey = INSTRUCTION,
-        pixels_key: NestedKey = PIXELS,
-        vocabulary_size: int | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(in_keys=[pixels_key], out_keys=[instruction_key])
+        super().__init__(in_keys=in_keys or [PIXELS], out_keys=out_keys or [INSTRUCTION])
         pairs = check_pairs(pairs)
-        self.vocabulary_size = vocabulary_size
         self.register_buffer("scenes", pairs[SCENE].reshape(-1), persistent=False)
         self.register_buffer("instructions", pairs[INSTRUCTION], persistent=False)
         hashes = pairs.get(FRAME_HASH, None)
@@ -119,10 +117,10 @@ class StartingPairs(InstructionTransform):
         if tensordict is None:
             tensordict = TensorDict({}, batch_size=parent.batch_size, device=parent.device)
         rows = tensordict.batch_size.numel()
-        beginning = self.beginning(tensordict, rows).cpu()
+        begins = self.new_rows(tensordict, rows).cpu()
         # Rows that go on get a valid number too: a first reset replaces every row.
         current = torch.zeros(rows, dtype=torch.int64)
-        current[beginning] = self._take(len(beginning))
+        current[begins] = self._take(len(begins))
         self._current = current.to(self.scenes.device)
         return tensordict.set(SCENE, self.scenes[self._current].view(*tensordict.batch_size, 1))
 
@@ -141,13 +139,14 @@ class StartingPairs(InstructionTransform):
         batch = tensordict_reset.batch_size
         pixels = tensordict_reset.get(self.in_keys[0])
         pixels = pixels.reshape(batch.numel(), *pixels.shape[len(batch) :])
-        rows = self.beginning(tensordict, batch.numel()).to(pixels.device)
+        rows = self.new_rows(tensordict, batch.numel()).to(pixels.device)
         expected = self.hashes[self._current].to(pixels.device)[rows]
         if (wrong := frame_hash(pixels[rows]) != expected).any():
             number = int(self.scenes[self._current].to(pixels.device)[rows][wrong][0])
             raise UserError(
-                f"scene {number} looks other than when its pair was stored: make the environment "
-                "with the task, seed, stream, layout and tile size that select_pairs was given"
+                f"scene {number} is not the one that its pair was stored with: make the "
+                "environment with the task, seed, stream, layout and tile size that select_pairs "
+                "was given"
             )
 
     def check_env(self, env: EnvBase) -> None:

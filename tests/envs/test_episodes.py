@@ -1,0 +1,275 @@
+"""Episodes of the pick-and-place environment: steps, resets, own sentences, given states."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from envs.stepping import assert_same, choose, everything, scenes
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.keys import STOP
+from ifo_grounding.tasks import (
+    TASKS,
+    VOCABULARY,
+    Goal,
+    Plan,
+    Scene,
+    SceneStream,
+    expert,
+    grammar,
+)
+from ifo_grounding.world import WorldState, render
+from ifo_grounding.world.dynamics import PICK_PLACE
+from reference import LETTERS, act, holds, plain, wishes
+
+# --- episodes ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_steps_and_rewards_agree_with_the_plain_rules(task):
+    env = PickAndPlaceEnv(task, 32, seed=0, max_steps=20)
+    td = env.reset()
+    start = worlds = plain(env.truth.state)
+    goals = list(wishes(grammar(task).parse_tokens(td["instruction"])))
+    draw = torch.Generator().manual_seed(0)
+    ends = 0
+    for time in range(20):
+        guess = torch.randint(6, (32,), generator=draw)
+        known = expert.act(env.truth.state, env.truth.wanted, draw)
+        actions = torch.where(torch.rand(32, generator=draw) < 0.1, guess, known)
+        after = choose(env, td, actions)
+        worlds = [act(w, LETTERS[a]) for w, a in zip(worlds, actions.tolist(), strict=True)]
+        assert plain(env.truth.state) == worlds
+        assert torch.equal(after["pixels"], render(env.truth.state))
+        over = [a == STOP or time == 19 for a in actions.tolist()]
+        rewards = [
+            float(ended and holds(first, world, goal))
+            for first, world, goal, ended in zip(start, worlds, goals, over, strict=True)
+        ]
+        assert after["reward"].squeeze(-1).tolist() == rewards
+        assert after["done"].squeeze(-1).tolist() == over
+        ends += sum(rewards)
+        td = after.exclude("reward")
+    assert ends > 16
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_success_is_judged_when_time_runs_out(late):
+    """The last move of the expert comes as action 40, or one too late."""
+    env = PickAndPlaceEnv("pick", 64, seed=0)
+    td = env.reset()
+    scene = env._simulator.stream.scenes(env.scene_numbers)
+    idles = scene.state.objects[torch.arange(64), scene.state.arm] == 0  # P does nothing there
+    assert idles.sum() > 30
+    begins = 40 - (scene.wanted.steps - 1) + late
+    for time in range(40):
+        wise = expert.act(env.truth.state, scene.wanted)
+        after = choose(env, td, torch.where(time < begins, PICK_PLACE, wise))
+        td = after.exclude("reward")
+        assert bool(after["truncated"].all()) == (time == 39)
+        assert not after["terminated"].any()
+        assert time == 39 or not after["reward"].any()
+    assert after["done"].all()
+    assert (after["reward"].squeeze(-1)[idles] == 1 - late).all()
+
+
+def test_the_paper_s_limit_is_the_default():
+    env = PickAndPlaceEnv("move", 2, seed=0)
+    walk = lambda td: td.set("action", torch.zeros(2, dtype=torch.int64))  # noqa: E731
+    rollout = env.rollout(100, walk)
+    assert rollout.shape == (2, 40)
+    assert rollout["next", "truncated"][:, -1].all()
+    assert not rollout["next", "done"][:, :-1].any()
+
+
+def test_partial_resets_touch_only_their_rows():
+    env = PickAndPlaceEnv("pick", 6, seed=0, expose_state=True)
+    td = env.reset()
+    for _ in range(5):
+        td = choose(env, td, torch.randint(5, (6,))).exclude("reward")
+    steps = env._simulator.steps.clone()
+    mask = torch.tensor([0, 1, 0, 0, 1, 1]).bool()
+    before = td.clone()
+    given = td.copy().set("_reset", mask.unsqueeze(-1))
+    after = env.reset(given, set_state=False)
+    assert after is given  # as EnvBase does
+    assert torch.equal(td["pixels"], before["pixels"])  # the images given stay as they were
+    for key, value in everything(after.exclude("_reset")).items():
+        old = before[key]
+        assert torch.equal(value[~mask], old[~mask])
+    changed = (after["pixels"] != before["pixels"]).flatten(1).any(1)
+    assert torch.equal(changed, mask)
+    assert torch.equal(env._simulator.steps, torch.where(mask, 0, steps))
+    assert env.scene_numbers.tolist() == [0, 6, 2, 3, 7, 8]
+    # The next step goes on from there in all rows.
+    shown = choose(env, after, torch.full((6,), STOP))
+    assert torch.equal(shown["pixels"], after["pixels"])
+
+
+@pytest.mark.parametrize("foreign", [False, True])
+@pytest.mark.parametrize("instructed", [False, True])
+def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
+    """So many that only what changed is drawn; with entries of others, as EnvBase resets them."""
+    env = PickAndPlaceEnv("pick", 256, seed=0, instructed=instructed)
+    td = env.reset()
+    for turn in range(8):
+        actions = 1 + torch.randint(5, (256,))
+        running = choose(env, td, actions).exclude("reward").set("action", actions)
+        assert torch.equal(running["pixels"], render(env._simulator.state))
+        numbers, mask = env.scene_numbers.clone(), torch.rand(256) < 0.2
+        given = running.clone().set("_reset", mask.unsqueeze(-1))
+        if foreign:
+            given["logits"] = torch.full((256, 6), torch.inf)
+            given["collector", "number"] = torch.arange(1, 257)
+        td = env.reset(given)
+        assert torch.equal(td["pixels"], render(env._simulator.state))
+        assert torch.equal(td["done"], running["done"] & ~mask.unsqueeze(-1))
+        assert torch.equal(td["action"], actions * ~mask)
+        assert torch.equal(env.scene_numbers != numbers, mask)
+        assert "_reset" not in td
+        if foreign:
+            assert torch.equal(td["logits"] == 0, mask.unsqueeze(-1).expand(-1, 6))
+            assert torch.equal(td["collector", "number"], torch.arange(1, 257) * ~mask)
+        if instructed:
+            began = env._simulator.stream.scenes(env.scene_numbers)
+            assert torch.equal(td["instruction"], began.instruction)
+            assert torch.equal(env.truth.wanted.objects, began.wanted.objects)
+        if turn % 2:  # twice, and a step, before anybody looks
+            env._simulator.reset(mask.nonzero().squeeze(-1)[:3])
+            env._simulator.step(torch.randint(5, (256,)))
+            td.update(env._observe())
+            assert torch.equal(td["pixels"], render(env._simulator.state))
+
+
+def test_partial_resets_can_name_their_scenes():
+    env = PickAndPlaceEnv("pick", 3, seed=0)
+    td = env.reset().clone()
+    td.update(
+        {"scene": scenes(50, 51, 52)["scene"], "_reset": torch.tensor([[0], [1], [0]]).bool()}
+    )
+    env.reset(td)
+    assert env.scene_numbers.tolist() == [0, 51, 2]
+
+
+# --- one's own sentence --------------------------------------------------------------------------
+
+
+def own(env, text, **more) -> TensorDict:
+    """A reset to the scenes as they are, with another instruction."""
+    tokens = VOCABULARY.encode(text).expand(env.num_envs, -1)
+    scene = env.scene_numbers.unsqueeze(-1)
+    return TensorDict({"scene": scene, "instruction": tokens, **more}, [env.num_envs])
+
+
+def test_a_reset_takes_one_s_own_sentence():
+    env = PickAndPlaceEnv("move", 64, seed=0)
+    first = env.reset().clone()
+    td = env.reset(own(env, "move to the red circle"))
+    assert torch.equal(td["pixels"], first["pixels"])
+    assert set(VOCABULARY.decode(td["instruction"])) == {"move to the red circle"}
+    suits = env.truth.wanted.verdict == 0
+    assert 5 < suits.sum() < 60
+    paid = torch.zeros(64, 1)
+    for _ in range(12):
+        td = choose(env, td, expert.act(env.truth.state, env.truth.wanted))
+        paid += td.pop("reward")
+    assert (paid[suits] >= 1).all()
+    with pytest.raises(UserError, match="'put it' is no sentence of move"):
+        env.reset(own(env, "put it"))
+    # What a past observation shows is no wish.
+    past = own(env, "move to the red circle", pixels=td["pixels"])
+    assert torch.equal(env.reset(past)["instruction"], first["instruction"])
+
+
+def test_another_sentence_amid_an_episode_is_refused():
+    env = PickAndPlaceEnv("move", 3, seed=0)
+    td = env.reset().set("instruction", VOCABULARY.encode("move to the red circle").expand(3, -1))
+    with pytest.raises(UserError, match=r"give it to reset\(\), in a TensorDict of 'scene'"):
+        env.rollout(2, auto_reset=False, tensordict=td)
+
+
+# --- without instructions, with the state --------------------------------------------------------
+
+
+def test_without_instructions_there_is_no_goal_and_no_reward():
+    env = PickAndPlaceEnv("move", 64, seed=0, instructed=False)
+    rollout = env.rollout(60, break_when_any_done=False)
+    assert "instruction" not in rollout
+    assert "instruction" not in rollout["next"]
+    assert rollout["next", "terminated"].any()
+    assert not rollout["next", "reward"].any()
+
+
+def test_a_learner_s_environment_hides_what_is_true():
+    """Neither its attributes nor its specs hold a state; what it keeps to itself, no goal."""
+    env = PickAndPlaceEnv("pick", 4, seed=0, instructed=False)
+    env.rollout(3)
+    names = {*vars(env), *vars(PickAndPlaceEnv)} - {"truth"}
+    values = [getattr(env, name) for name in names if not name.startswith("_")]
+    values += [v for value in values for v in getattr(value, "__dict__", {}).values()]
+    assert not any(isinstance(v, WorldState | Scene | Plan | Goal | SceneStream) for v in values)
+    for spec in (env.output_spec, env.input_spec):
+        parts = {part for key in spec.keys(True, True) for part in key}
+        assert not {"state", "objects", "instruction"} & parts
+    with pytest.raises(UserError, match="keeps its true state to itself"):
+        _ = env.truth
+    for kept in (env, pickle.loads(pickle.dumps(env))):
+        scenes = [kept._simulator.scene, kept._simulator.stream.scenes(torch.arange(50))]
+        assert not any(s.instruction.any() or s.wanted.objects.any() for s in scenes)
+
+
+def test_the_state_is_hidden():
+    env = PickAndPlaceEnv("pick", 4, seed=0)
+    keys = set(everything(env.rollout(5)))
+    assert not any("state" in key or "scene" in key for key in keys)
+    assert not list(env.state_spec.keys(True, True))
+    with pytest.raises(NotImplementedError, match="set_state"):
+        env.reset(env.reset(), set_state=True)
+
+
+def test_the_exposed_state_is_what_the_pixels_show_all_along():
+    """Also after resets: what was recorded earlier must not change under the reader."""
+    env = PickAndPlaceEnv("pick", 8, seed=0, expose_state=True)
+    rollout = env.rollout(80, break_when_any_done=False)
+    assert rollout["next", "done"].sum() > 20
+    for td in (rollout, rollout["next"]):
+        state = WorldState(**td["state"].to_dict(), batch_size=td.batch_size)
+        assert torch.equal(render(state), td["pixels"])
+
+
+def test_an_episode_can_begin_in_a_given_state():
+    env = PickAndPlaceEnv("pick-out", 5, seed=0, expose_state=True)
+    first = env.reset().clone()
+    later = env.reset()
+    assert not torch.equal(first["pixels"], later["pixels"])
+    again = env.reset(first.clone(), set_state=True)
+    assert_same(again, first)
+    assert env.scene_numbers.tolist() == [-1] * 5
+    for _ in range(40):
+        wise = expert.act(env.truth.state, env.truth.wanted)
+        again = choose(env, again, wise).exclude("reward")
+        if again["done"].all():
+            break
+    goals = grammar("pick-out").parse_tokens(first["instruction"])
+    start = WorldState(**first["state"].to_dict(), batch_size=[5])
+    ends = zip(plain(start), plain(env.truth.state), wishes(goals), strict=True)
+    assert all(holds(*episode) for episode in ends)
+
+
+def test_a_given_state_needs_no_instruction_where_there_are_none():
+    env = PickAndPlaceEnv("pick", 5, seed=0, expose_state=True, instructed=False)
+    first = env.reset().clone()
+    env.reset()
+    assert_same(env.reset(first.clone(), set_state=True), first)
+
+
+def test_steps_begin_at_the_state_in_the_tensordict():
+    env = PickAndPlaceEnv("move", 3, seed=0, expose_state=True)
+    td = env.reset()
+    td["state", "arm"] = torch.tensor([35, 0, 7])
+    after = choose(env, td, torch.tensor([0, 1, 2]))
+    assert after["state", "arm"].tolist() == [29, 1, 13]

@@ -1,0 +1,192 @@
+"""Many worlds of Gymnasium, moved by one batched simulator."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.envs.gymnasium_envs import PickAndPlaceVectorEnv
+from ifo_grounding.errors import UserError
+from ifo_grounding.keys import STOP
+from ifo_grounding.tasks import VOCABULARY, expert
+
+NAMES = {
+    "move": "ifo_grounding/Move-v0",
+    "pick": "ifo_grounding/Pick-v0",
+    "pick-out": "ifo_grounding/PickOut-v0",
+}
+UP = 0
+
+
+def wise(env) -> np.ndarray:
+    """Actions of the expert."""
+    scene = env._simulator.scene
+    return expert.act(scene.state, scene.wanted).numpy()
+
+
+@pytest.mark.filterwarnings("error")  # Gymnasium's own logger ends in warnings.warn
+def test_make_vec_is_native():
+    envs = gymnasium.make_vec(NAMES["pick"], num_envs=5)
+    assert isinstance(envs, PickAndPlaceVectorEnv)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    observations, infos = envs.reset(seed=0)
+    assert observations in envs.observation_space
+    assert envs.single_observation_space == gymnasium.make(NAMES["pick"]).observation_space
+    assert envs.action_space.shape == (5,)
+    said = VOCABULARY.decode(torch.from_numpy(observations["instruction"]))
+    assert infos["instruction_text"].tolist() == said
+    assert infos["_instruction_text"].all()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize("task", ["move", "pick-out"])
+def test_one_world_many_worlds_and_torchrl_agree(task, mode):
+    """The same scenes and actions give the same pixels, words, rewards and ends in all three."""
+    n = 6
+    batch = PickAndPlaceEnv(task, n, seed=9, max_steps=9)
+    envs = gymnasium.make_vec(NAMES[task], num_envs=n, autoreset_mode=mode, max_steps=9)
+    singles = [gymnasium.make(NAMES[task], max_steps=9) for _ in range(n)]
+    td = batch.reset()
+    observations, infos = envs.reset(seed=9)
+    for number, env in enumerate(singles):
+        env.reset(seed=9)
+        single, info = env.reset(options={"scene": number})
+        assert np.array_equal(single["pixels"], observations["pixels"][number])
+        assert info["instruction_text"] == infos["instruction_text"][number]
+    assert np.array_equal(td["pixels"].numpy(), observations["pixels"])
+    assert np.array_equal(td["instruction"].numpy(), observations["instruction"])
+
+    draw = np.random.default_rng(0)
+    over, success = np.zeros(n, bool), 0.0
+    while not over.all():
+        actions = np.where(draw.random(n) < 0.15, draw.integers(0, 6, n), wise(batch))
+        live = ~over
+        td = batch.step(td.set("action", torch.from_numpy(actions)))["next"].exclude("reward")
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        last = infos.get("final_obs") if mode is AutoresetMode.SAME_STEP else None
+        for row in np.flatnonzero(live):
+            single, paid, end, late, info = singles[row].step(int(actions[row]))
+            assert (paid, end, late) == (rewards[row], terminated[row], truncated[row])
+            seen = {name: value[row] for name, value in observations.items()}
+            if (end or late) and last is not None:
+                seen, infos_row = last[row], infos["final_info"]
+                assert infos["_final_obs"][row]
+                assert infos["_final_info"][row]
+            else:
+                infos_row = infos
+            assert np.array_equal(single["pixels"], seen["pixels"])
+            assert np.array_equal(single["instruction"], seen["instruction"])
+            assert np.array_equal(single["pixels"], td["pixels"][row].numpy())
+            assert info["instruction_text"] == infos_row["instruction_text"][row]
+            assert bool(td["done"][row]) == (end or late)
+            if end or late:
+                assert info["is_success"] == infos_row["is_success"][row] == bool(paid)
+                assert infos_row["_is_success"][row]
+            else:
+                assert "is_success" not in infos_row or not infos_row["_is_success"][row]
+            success += paid
+        over |= terminated | truncated
+        if mode is AutoresetMode.DISABLED and (terminated | truncated).any():
+            envs.reset(options={"reset_mask": terminated | truncated})
+    assert success > 0
+
+
+def test_next_step_autoreset_takes_a_step_of_its_own():
+    envs = gymnasium.make_vec(NAMES["move"], num_envs=3)
+    first, _ = envs.reset(seed=0)
+    ended, rewards, terminated, _, infos = envs.step(np.array([STOP, UP, STOP]))
+    assert terminated.tolist() == [True, False, True]
+    assert infos["_is_success"].tolist() == [True, False, True]
+    assert np.array_equal(ended["pixels"][0], first["pixels"][0])
+    # The action of an ended world is not looked at: it would stop the new episode.
+    fresh, rewards, terminated, truncated, infos = envs.step(np.array([STOP, UP, STOP]))
+    assert not (rewards.any() or terminated.any() or truncated.any())
+    assert "is_success" not in infos
+    stream = PickAndPlaceEnv("move", 5, seed=0).reset()["pixels"].numpy()
+    assert np.array_equal(fresh["pixels"][[0, 2]], stream[[3, 4]])
+    said = VOCABULARY.decode(torch.from_numpy(fresh["instruction"]))
+    assert infos["instruction_text"].tolist() == said
+    assert envs.step(np.array([STOP, UP, UP]))[2].tolist() == [True, False, False]
+
+
+def test_same_step_autoreset_keeps_the_last_observation():
+    envs = gymnasium.make_vec(NAMES["move"], num_envs=3, autoreset_mode="SameStep")
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    first, start = envs.reset(seed=0)
+    fresh, _, terminated, _, infos = envs.step(np.array([UP, STOP, UP]))
+    assert terminated.tolist() == [False, True, False]
+    assert infos["_final_obs"].tolist() == [False, True, False]
+    assert infos["final_obs"][0] is None
+    assert np.array_equal(infos["final_obs"][1]["pixels"], first["pixels"][1])
+    assert infos["final_info"]["is_success"].tolist() == [False, False, False]
+    assert infos["final_info"]["_is_success"].tolist() == [False, True, False]
+    assert infos["final_info"]["instruction_text"][1] == start["instruction_text"][1]
+    stream = PickAndPlaceEnv("move", 4, seed=0).reset()["pixels"].numpy()
+    assert np.array_equal(fresh["pixels"][1], stream[3])
+    assert "is_success" not in infos
+    assert "final_obs" not in envs.step(np.array([UP, UP, UP]))[4]
+
+
+def test_without_autoreset_the_caller_resets():
+    envs = gymnasium.make_vec(NAMES["move"], num_envs=3, autoreset_mode=AutoresetMode.DISABLED)
+    before, _ = envs.reset(seed=0)
+    envs.step(np.array([STOP, UP, STOP]))
+    with pytest.raises(UserError, match="2 worlds have ended"):
+        envs.step(np.array([UP, UP, UP]))
+    mask = np.array([True, False, True])
+    fresh, infos = envs.reset(options={"reset_mask": mask})
+    assert infos["_instruction_text"].tolist() == mask.tolist()
+    stream = PickAndPlaceEnv("move", 5, seed=0).reset()["pixels"].numpy()
+    assert np.array_equal(fresh["pixels"][[0, 2]], stream[[3, 4]])
+    assert np.array_equal(fresh["instruction"][1], before["instruction"][1])
+    assert not envs.step(np.array([UP, UP, UP]))[2].any()
+
+
+def test_infos_equal_those_of_gymnasium_s_own_vectorizer():
+    modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+    for mode in modes:
+        native = gymnasium.make_vec(NAMES["move"], 2, autoreset_mode=mode)
+        loop = gymnasium.make_vec(NAMES["move"], 2, "sync", vector_kwargs={"autoreset_mode": mode})
+        formats = []
+        for envs in (native, loop):
+            seen = [shape(envs.reset(seed=0)[1])]
+            for actions in ([STOP, UP], [UP, UP], [UP, STOP]):
+                result = envs.step(np.array(actions))
+                seen.append((shape(result[4]), *(part.dtype for part in result[1:4])))
+            formats.append(seen)
+        assert formats[0] == formats[1]
+
+
+def shape(infos: dict) -> dict:
+    """Keys, types and masks of infos; their scenes differ."""
+    return {
+        key: shape(value)
+        if isinstance(value, dict)
+        else (value.dtype, value.tolist() if key.startswith("_") else None)
+        for key, value in infos.items()
+    }
+
+
+def test_observations_and_infos_are_new_at_every_call():
+    envs = gymnasium.make_vec(NAMES["pick"], num_envs=3)
+    kept, infos = envs.reset(seed=0)
+    copies = {name: value.copy() for name, value in kept.items()}
+    texts = infos["instruction_text"].copy()
+    for _ in range(3):
+        envs.step(np.array([STOP, UP, STOP]))
+    assert all(np.array_equal(kept[name], copies[name]) for name in kept)
+    assert infos["instruction_text"].tolist() == texts.tolist()
+
+
+def test_gymnasium_s_vector_wrappers_work():
+    envs = RecordEpisodeStatistics(gymnasium.make_vec(NAMES["move"], num_envs=4))
+    envs.reset(seed=0)
+    for _ in range(30):
+        envs.step(wise(envs.unwrapped))
+    assert len(envs.return_queue) >= 4
+    assert set(envs.return_queue) == {1.0}
