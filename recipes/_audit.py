@@ -47,7 +47,7 @@ def audit_callback(
             "success_stopped": result.stopped.rate,
             "audit_return": float(played.returns.mean()),
             "audit_success": played.success.rate,
-            "judge_auc": played.auc.value,
+            "return_auc": played.auc.value,
             **(instructions() if world.oracle else {}),
             **(actions() if world.oracle else {}),
         }

@@ -11,8 +11,6 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
-from ifo_grounding.report.results import effective
-
 
 def changes(
     then: Mapping[str, Any], arguments: Sequence[str], sections: Sequence[str] | None = None
@@ -51,6 +49,12 @@ def flat(section: DictConfig | dict[str, Any], above: str = "") -> dict[str, Any
         full = above + name
         found |= flat(value, f"{full}.") if isinstance(value, dict) else {full: value}
     return found
+
+
+def effective(section: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a section that have an effect: one trial is none."""
+    alone = ("trials", "trial_steps", "trial_halvings") if section.get("trials", 1) == 1 else ()
+    return {name: value for name, value in section.items() if name not in alone}
 
 
 def in_effect(options: dict[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Write the report of a run: table, curves, chosen instructions and episodes, as one page."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -140,11 +139,6 @@ def step_by_step(
     return found
 
 
-def _known(value: float | None) -> float:
-    """Return what was logged; what was not finite is kept as null."""
-    return math.nan if value is None else value
-
-
 def curves(run: Run) -> dict[str, Any]:
     """Plot what was logged, stage by stage."""
     found: dict[str, Any] = {}
@@ -153,12 +147,8 @@ def curves(run: Run) -> dict[str, Any]:
         if not path.exists() or not run.is_current(stage):
             continue
         history = read_json(path)
-        metrics = {
-            name: ([row["step"] for row in history], [_known(row[name]) for row in history])
-            for name in wanted
-            if all(name in row for row in history)
-        }
-        found[title] = training_curves(metrics)
+        logged = [name for name in wanted if any(name in row for row in history)]
+        found[title] = training_curves(history, logged)
         if stage == "self_examine":
             found["Audit of self-examination (validation scenes)"] = audit_figure(history)
         audited = [row for row in history if "success" in row]

@@ -125,7 +125,7 @@ def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
     assert "continued" in alone and "cloned" not in alone
     results = study(options)
     names = ("phase1", "phase2", "continued", "cloned")
-    assert "accepted rollouts cloned, success (control)" in results_table(results)
+    assert "imitation continued, success (control)" in results_table(results)
     assert len({results[name]["scenes"] for name in names}) == 1
     assert all(len(bytes.fromhex(results[name]["outcomes"])) == 7 for name in names)  # 50 scenes
     section = options.self_examine
@@ -142,7 +142,7 @@ def test_a_study_compares_phase_2_with_its_controls(compose, tmp_path):
     from study import audit
 
     metrics = tmp_path / "run" / "metrics" / "self_examine.json"
-    write_json(metrics, [{"step": 1.0, "judge_auc": math.nan, "success": 1.0, "other": 2.0}])
+    write_json(metrics, [{"step": 1.0, "return_auc": math.nan, "success": 1.0, "other": 2.0}])
     assert audit(options) == [{"step": 1.0, "success": 1.0}]
     [path] = (tmp_path / "results").glob("*.json")
     assert path.name == "move-300-strong-seed0.json"
