@@ -104,5 +104,6 @@ def _draw_cell(cell: Cell, width: int, above: int, below: int) -> Image.Image:
     for line in wrapped(cell.caption, width):
         draw.text((0, y), line, INK, font())
         y += LINE
-    draw.text((0, y), cell.note, cell.colour, font(bold=True))
+    legible = FAINT if cell.colour == RUNNING else cell.colour
+    draw.text((0, y), cell.note, legible, font(bold=True))
     return canvas
