@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.report.plots import known
-from ifo_grounding.report.theme import PALETTE, add_legend, dress, in_percent, new_figure
+from ifo_grounding.report.theme import PALETTE, add_legend, dress, in_percent, new_panels
 
 PANELS: dict[str, dict[str, str]] = {
     "Learned return and true success": {
@@ -58,12 +58,8 @@ def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
     panels = [(title, lines) for title, lines in panels if lines]
     if not panels:
         raise UserError("the history holds nothing to audit: was it a self-examination?")
-    columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
-    figure, grid = new_figure(4.4 * columns + 0.4, 2.7 * rows, rows, columns)
-    for axes in grid.flat[len(panels) :]:
-        axes.set_visible(False)
-    for axes, (title, lines) in zip(grid.flat, panels, strict=False):
+    figure, grid = new_panels(len(panels), 4.4, 2.6)
+    for axes, (title, lines) in zip(grid, panels, strict=True):
         _panel(axes, title, lines)
         axes.set_xlim(history[0]["step"] - 0.5, history[-1]["step"] + 0.5)
     return figure

@@ -13,7 +13,15 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from scipy.ndimage import uniform_filter1d
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.report.theme import FAINT, PALETTE, add_legend, dress, in_percent, new_figure
+from ifo_grounding.report.theme import (
+    FAINT,
+    PALETTE,
+    add_legend,
+    dress,
+    in_percent,
+    new_figure,
+    new_panels,
+)
 from ifo_grounding.stats import Rate
 
 SHARES = ("accuracy", "probability", "removed", "share", "stopped", "success", "sampled")
@@ -63,12 +71,8 @@ def training_curves(
     missing = [name for name in chosen if name not in logged]
     if missing or not chosen:
         raise UserError(f"no metric {missing or ''}: logged were {', '.join(logged) or 'none'}")
-    columns = min(columns, len(chosen))
-    rows = -(-len(chosen) // columns)
-    figure, grid = new_figure(4.2 * columns + 0.4, 2.5 * rows + 0.2, rows, columns)
-    for axes in grid.flat[len(chosen) :]:
-        axes.set_visible(False)
-    for axes, (name, points) in zip(grid.flat, series.items(), strict=False):
+    figure, panels = new_panels(len(chosen), 4.2, 2.5, columns)
+    for axes, (name, points) in zip(panels, series.items(), strict=True):
         _curve(axes, name, points, smooth or max(1, len(points) // 50), x)
     return figure
 
@@ -133,13 +137,15 @@ def rates_by_number(
     *,
     x: str = "demonstrations",
     references: Mapping[str, Mapping[str, float]] | None = None,
+    columns: int = 3,
 ) -> Figure:
-    """Draw rates against a number that grows by factors, with intervals, in panels side by side.
+    """Draw rates against a number that grows by factors, with intervals, one panel per group.
 
     Args:
         panels: title of the panel -> {name of the curve: {number: rate}}.
         x: what the number counts.
         references: title of the panel -> {name: rate}, each drawn as a dashed line across.
+        columns: panels side by side.
 
     >>> from ifo_grounding.stats import wilson
     >>> curves = {"phase 1": {500: wilson(60, 100), 2000: wilson(80, 100)}}
@@ -154,8 +160,8 @@ def rates_by_number(
     numbers = sorted({number for curve in every for number in curve})
     lines = [rate for panel in (references or {}).values() for rate in panel.values()]
     low = min([*lines, *(rate.low for curve in every for rate in curve.values())])
-    figure, grid = new_figure(1.6 + 2.8 * len(panels), 3.4, columns=len(panels))
-    for axes, (title, curves) in zip(grid[0], panels.items(), strict=True):
+    figure, grid = new_panels(len(panels), 3.2, 3.0, columns)
+    for axes, (title, curves) in zip(grid, panels.items(), strict=True):
         dress(axes, title, x)
         axes.set_xscale("log")
         for name, curve in curves.items():
@@ -169,7 +175,7 @@ def rates_by_number(
         axes.set_xlim(0.8 * numbers[0], 1.25 * numbers[-1])
         axes.minorticks_off()
         in_percent(axes, max(0.0, 0.1 * math.floor(10 * low)))
-    _shared_legend(figure, grid[0])
+    _shared_legend(figure, grid)
     return figure
 
 

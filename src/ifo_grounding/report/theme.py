@@ -31,6 +31,18 @@ def new_figure(
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def new_panels(
+    count: int, width: float, height: float, columns: int = 2
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure and its axes, each of some inches, so many side by side."""
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    figure, grid = new_figure(width * columns + 0.4, height * rows + 0.2, rows, columns)
+    for axes in grid.flat[count:]:
+        axes.set_visible(False)
+    return figure, list(grid.flat[:count])
+
+
 def dress(axes: Axes, title: str = "", x: str = "", y: str = "", grid: str = "y") -> None:
     """Give axes a title, labels and a faint grid along ``grid``: x, y, both or none of them."""
     axes.set_title(title, loc="left", fontsize=11, fontweight="bold", color=INK)
