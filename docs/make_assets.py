@@ -1,25 +1,21 @@
 """Draw the pictures of the README: ``python docs/make_assets.py RUN`` after a demo run.
 
-``world.png`` shows a scene of each task; ``agent.gif`` a policy of that run (a name or a path). One
-that was trained with ``world.split=train`` gives ``evidence.png`` instead: what its words say.
+``world.png`` shows a scene of each task; ``agent.gif`` the policy of that run (a name or a path).
 """
 
 import sys
-from pathlib import Path
-from typing import Any
 
 import torch
+from pages import write
 
 from ifo_grounding import networks
-from ifo_grounding.evaluation import record_episodes, word_evidence
-from ifo_grounding.files import atomic_write, read_json
-from ifo_grounding.report import Case, animation, evidence_figure, figure_png, gallery
+from ifo_grounding.evaluation import record_episodes
+from ifo_grounding.files import read_json
+from ifo_grounding.report import Case, animation, gallery
 from ifo_grounding.tasks import TASKS, VOCABULARY, SceneOptions, SceneStream
-from ifo_grounding.tasks.grammar import HOLDOUTS
 from ifo_grounding.training import Run
 from ifo_grounding.world import render
 
-ASSETS = Path(__file__).parent / "assets"
 SCENES = range(4)
 
 
@@ -41,24 +37,7 @@ def agent(run: Run) -> bytes:
     return animation(shown, columns=len(SCENES), width=180)
 
 
-def evidence(run: Run, options: dict[str, Any]) -> bytes:
-    policy = networks.load(run.need("policy-phase1.safetensors", "two_phase"))
-    return figure_png(evidence_figure(word_evidence(policy), HOLDOUTS[options["world"]["holdout"]]))
-
-
-def main() -> None:
+if __name__ == "__main__":
     if len(sys.argv) != 2:
         raise SystemExit("usage: python docs/make_assets.py RUN")
-    run = Run(sys.argv[1])
-    options = read_json(run.need("options.json", "two_phase"))
-    if options["world"]["split"] == "train":
-        pictures = {"evidence.png": evidence(run, options)}
-    else:
-        pictures = {"world.png": world(), "agent.gif": agent(run)}
-    for name, content in pictures.items():
-        with atomic_write(ASSETS / name) as temporary:
-            temporary.write_bytes(content)
-
-
-if __name__ == "__main__":
-    main()
+    write({}, {"world.png": world(), "agent.gif": agent(Run(sys.argv[1]))})

@@ -1,6 +1,5 @@
 """Write the report of a run: table, curves, chosen instructions and episodes, as one page."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -143,20 +142,13 @@ def curves(run: Run) -> dict[str, Any]:
         path = run / "metrics" / f"{stage}.json"
         if not path.exists():
             continue
-        history = [
-            {name: math.nan if value is None else value for name, value in row.items()}
-            for row in read_json(path)
-        ]
+        history = read_json(path)
         found[title] = training_curves(
-            {
-                name: ([row["step"] for row in history], [row[name] for row in history])
-                for name in wanted
-                if all(name in row for row in history)
-            }
+            history, [name for name in wanted if any(name in row for row in history)]
         )
         if stage == "self_examine":
             found["Audit of self-examination (validation scenes)"] = audit_figure(history)
-        audited = [row for row in history if "success" in row]
+        audited = [row for row in history if row.get("success") is not None]
         if len(audited) > 1:
             found["Success in training (validation scenes)"] = success_over_iterations(
                 [row["step"] for row in audited],

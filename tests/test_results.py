@@ -1,218 +1,158 @@
 """Tables of results say what the committed files say."""
 
-import importlib.util
+import re
+from itertools import product
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+import make_results
+import make_speed
+import make_tables
+import pages
+import pytest
 
-from ifo_grounding._folder import recipes_folder
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.stats import wilson
 
 ROOT = Path(__file__).parents[1]
 
 
-def load_script(name="make_results"):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    """An empty folder of results, which the scripts read instead of the committed one."""
+    monkeypatch.setattr(pages, "RESULTS", tmp_path)
+    caches = make_results.runs_of.cache_clear, make_tables.pieces.cache_clear
+    for clear in caches:
+        clear()
+    yield tmp_path
+    for clear in caches:
+        clear()
 
 
-def test_the_tables_are_up_to_date():
-    script = load_script()
-    assert script.runs()
-    for path, text in script.written().items():
-        assert path.read_text() == text, f"{path.name}: run python docs/make_results.py"
-
-
-def test_the_table_of_speeds_is_up_to_date():
-    for path, text in load_script("make_speed").written().items():
-        assert path.read_text() == text, f"{path.name}: run python docs/make_speed.py"
-
-
-def test_the_tables_of_the_paper_are_up_to_date():
-    for path, text in load_script("make_tables").written().items():
-        assert path.read_text() == text, f"{path.name}: run python docs/make_tables.py"
+def test_every_table_of_the_pages_is_what_the_scripts_write():
+    tables = make_results.tables() | make_tables.tables() | make_speed.tables()
+    shown = set()
+    for page in pages.pages():
+        text = page.read_text()
+        marks = {found["name"] for found in pages.TABLE.finditer(text)}
+        assert marks <= set(tables), f"{page.name} shows tables that no script writes"
+        again = "run python docs/make_results.py, make_tables.py or make_speed.py"
+        assert pages.renewed(text, tables) == text, f"{page.name}: {again}"
+        shown |= marks
+    assert shown == set(tables)
 
 
 def test_every_result_says_where_it_comes_from():
-    script = load_script()
-    studied = [run for seeds in script.studies().values() for run in seeds]
-    studied += [run for seeds in load_script("make_tables").pieces().values() for run in seeds]
-    for folder in ("babyai", "recombined", "zero-shot"):
-        studied += [read_json(path) for path in (ROOT / "results" / folder).glob("*.json")]
-    for run in [*script.runs(), *studied]:
-        commands = ("run study", "run zero_shot", "evaluate") if run in studied else ("demo",)
-        assert any(run["command"].startswith(f"ifo-grounding {command}") for command in commands)
-        assert run["provenance"]["commit"]
-        assert not run["provenance"]["commit"].endswith("+"), "made from files that changed since"
+    folders = ("babyai", "study", "tables")
+    found = [read_json(file) for of in folders for file in (ROOT / "results" / of).glob("*.json")]
+    assert len(found) > 200
+    for run in found:
+        assert run["command"].startswith("ifo-grounding ")
+        assert re.fullmatch(r"[0-9a-f]{12}", run["provenance"]["commit"]), "files had changed since"
         assert run["options"]["seed"] is not None
         assert run["seconds"] > 0
-        measured = "held-out" if "zero_shot" in run["command"] else "phase1"
-        assert run["results"][measured]["rate"]["count"] >= 2000
+        assert run["results"]["phase1"]["rate"]["count"] >= 2000
 
 
-def test_a_study_compares_policies_over_its_seeds(tmp_path, monkeypatch):
-    script = load_script()
-    (tmp_path / "results" / "study").mkdir(parents=True)
-    solved = {"phase1": "f0", "phase2": "fc", "continued": "f8"}
-    for seed in range(2):
-        results = {name: {"outcomes": bits, "rate": {"count": 8}} for name, bits in solved.items()}
-        rates = {"rate": 0.9, "served": 0.5, "servable": 0.6}
-        results["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
-        given = ["task=pick", "budget=study", "demonstrations.n=2000", f"seed={seed}"]
-        with initialize_config_dir(version_base=None, config_dir=str(recipes_folder() / "conf")):
-            options = OmegaConf.to_container(
-                compose("study", ["run=unnamed", *given]), resolve=True
-            )
-        if seed:
-            del results["continued"]
-        else:  # as before there was a prior
-            del options["imitate"]["prior"]
-            options["instruction"]["threshold"] = 0.7
-        run = {
-            "options": options,
-            "results": results,
-            "command": " ".join(["ifo-grounding run study", *given]),
-            "provenance": {"commit": "abc"},
-        }
-        write_json(tmp_path / "results" / "study" / f"{seed}.json", run)
-    monkeypatch.setattr(script, "ROOT", tmp_path)
-    first = next(iter(script.studies().values()))
-    assert script.outcomes(first, "phase2").tolist() == [[True] * 6 + [False] * 2] * 2
-    table = "\n".join(script.study_section())
-    for shown in ("| pick | 2,000 | strong | 2† |", "50.0%", "75.0%", "+25.0", "+12.5", "not run"):
-        assert shown in table
-    assert "(1 of 2 seeds)" in table
-    assert (
-        "- pick 2,000 strong (1 of 2 seeds): no imitate.prior (now 2000), "
-        "instruction.threshold=0.7 (now 0.6)\n" in table
-    )
+def test_a_page_keeps_what_is_not_its_table():
+    text = "a\n<!-- x -->\nold\n<!-- /x -->\nb\n<!-- y -->\nkept\n<!-- /y -->\n<!-- x y -->"
+    assert pages.renewed(text, {"x": "new"}) == text.replace("old", "new")
 
 
-def test_the_fewest_demonstrations_that_beat_the_paper_are_found(monkeypatch):
-    script = load_script()
-    rates = {
-        n: dict.fromkeys(script.PHASES, wilson(hits, 1000))
-        for n, hits in {200: 780, 500: 860, 2000: 900}.items()
-    }
-    monkeypatch.setattr(script, "efficient", lambda: {"move": rates})
-    [row] = [line for line in script.efficiency_section()[-1].splitlines() if "| move |" in line]
-    assert row.endswith("| 200 | 500 | 500 |")
-    lines = script.efficiency_picture().axes[0].lines
-    assert [0.794, 0.794] in [list(line.get_ydata()) for line in lines]
+def policy(bits):
+    return {"outcomes": bits, "rate": {"count": 8}}
 
 
-def test_levels_of_babyai_are_compared_with_their_references(tmp_path, monkeypatch):
-    script = load_script()
-    folder = tmp_path / "results" / "babyai"
-    folder.mkdir(parents=True)
-    solved = {"phase1": "f0", "phase2": "fc", "true_actions": "f8", "demonstrator": "ff"}
-    results = {name: {"outcomes": bits, "rate": {"count": 8}} for name, bits in solved.items()}
-    run = {
-        "options": {
-            "task": "GoToObj",
-            "demonstrations": {"n": 1000},
-            "network": "film",
-            "seed": 0,
-        },
+def piece(task, results, **options):
+    return {
+        "options": {"task": task, "variant": None, **options},
         "results": results,
         "seconds": 755.0,
         "stages": {"imitate": 725.0, "imitate_truth": 30.0},
-        "command": "ifo-grounding run study world=babyai",
-        "provenance": {"commit": "abc"},
     }
-    write_json(folder / "0.json", run)
-    monkeypatch.setattr(script, "ROOT", tmp_path)
-    lines = "\n".join(script.babyai_section()).splitlines()
-    [ran] = [line for line in lines if line.startswith("| GoToObj | 1,000 | film | 1 |")]
-    assert all(f"| {rate}% [" in ran for rate in ("100.0", "62.5", "50.0", "75.0"))
-    assert "| +25.0 [" in ran and ran.endswith("| 12 |") and "not run" not in ran
-    [waiting] = [line for line in lines if line.startswith("| GoToLocal |")]
-    assert waiting.count("not run") == 6
-    assert "ifo-grounding run study world=babyai" in "\n".join(lines)
+
+
+def test_a_study_compares_policies_over_its_seeds(results):
+    solved = {"phase1": "f0", "phase2": "fc", "continued": "f8"}
+    measured = {name: policy(bits) for name, bits in solved.items()}
+    rates = {"rate": 0.9, "served": 0.5, "servable": 0.6}
+    measured["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
+    for seed in range(2):
+        run = piece("pick", measured, demonstrations={"n": 200})
+        write_json(results / "study" / f"{seed}.json", run)
+        measured.pop("continued", None)  # one seed has the control
+    row = make_results.study_rows()["pick", 200]
+    assert row["seeds"] == 2
+    assert row["phase 1"].startswith("50.0% [") and row["phase 2"].startswith("75.0% [")
+    assert row["gain, points"].startswith("+25.0 [")
+    assert row["over continued imitation"].startswith("+12.5 [")
+    assert row["over continued imitation"].endswith("] (seeds: 1)")
+    [row] = make_results.choice_rows(200)
+    assert list(row.values()) == ["pick", "90.0%", "50.0%", "60.0%"]
+
+
+def test_levels_of_babyai_are_compared_with_their_references(results):
+    solved = {"phase1": "f0", "phase2": "f0", "true_actions": "f8"}
+    measured = {name: policy(bits) for name, bits in solved.items()}
+    run = piece("GoToObj", measured, demonstrations={"n": 1000})
+    write_json(results / "babyai" / "0.json", run)
+    [row] = make_results.babyai_rows()
+    assert row["bot"] == "not run"
+    assert row["true actions"].startswith("62.5% [")
+    assert row["gain, points"] == "phase 1 kept"
+    assert row["minutes"] == 12  # without the references
 
 
 def test_gains_of_the_paper_have_newcombes_interval():
-    gain = load_script("make_tables").gain_of_paper(wilson(48, 80), wilson(56, 70))
-    assert gain == "+20.0 [+5.2, +33.4] points"  # 0.0524 and 0.3339 in his table II, method 10
+    gain = make_tables.gain_of_paper(wilson(48, 80), wilson(56, 70))
+    assert gain == "+20.0 [+5.2, +33.4]"  # 0.0524 and 0.3339 in his table II, method 10
 
 
-def test_the_tables_of_the_paper_are_made_from_pieces(tmp_path, monkeypatch):
-    script = load_script("make_tables")
-    folder = tmp_path / "results" / "tables"
-    folder.mkdir(parents=True)
-
+def test_the_tables_of_the_paper_are_made_from_pieces(results):
     def rate(successes, count):
         return wilson(successes, count).as_dict()
 
-    def solved(bits):
-        return {"outcomes": bits, "rate": {"count": 8}}
-
-    suitability = {"rate": rate(60, 80), "served": rate(80, 100), "servable": rate(90, 100)}
-    suitability["errors"] = {"missing": 15, "occupied": 5}
-    results = {
-        "phase-1": {"phase1": solved("f0"), "suitability": suitability},
-        "pairs-5000": {
-            "phase1": solved("f0"),
-            "phase2": solved("fc"),
-            "changes": {
-                "gained": {"stuck": 2},
-                "lost": {"stuck": 0},
-                "other path": 1,
-                "same path": 3,
-            },
+    errors = dict.fromkeys(make_tables.ERRORS, 0) | {"missing": 15}
+    changes = {part: dict.fromkeys(make_tables.FAILURES, 0) for part in ("gained", "lost")}
+    changes["gained"]["stuck"] = 2
+    measured = {
+        "phase1": policy("f0"),
+        "phase2": policy("fc"),
+        "continued": policy("f8"),
+        "changes": {**changes, "other path": 1, "same path": 3},
+        "suitability": {
+            "rate": rate(60, 80),
+            "served": rate(80, 100),
+            "servable": rate(90, 100),
+            "errors": errors,
         },
+        "trained": {"phase1": {"counts": {"success": 9, "stuck": 1}}},
     }
-    today = script.today("strong", "pick")
-    earlier = {**today, "imitate": {**today["imitate"], "steps": 1}}
-    of_paper = script.today("paper", "pick")
-    assert of_paper["instruction"] == {"steps": 12000, "near": 0.5}  # of the task, too
-    for preset, phase, like, said in (
-        ("strong", "phase-1", "phase-1", today),
-        ("strong", "pairs-5000", "pairs-5000", earlier),
-        ("paper", "phase-1", "phase-1", of_paper),
-        ("paper", "goal-pairs-5000", "pairs-5000", of_paper),
-    ):
-        piece = {
-            "options": {"task": "pick", "network": preset, "variant": phase, "seed": 0, **said},
-            "results": results[like],
-            "command": f"ifo-grounding run study variant={phase}",
-            "provenance": {"commit": "abc", "machine": "a machine"},
-            "seconds": 600,
-            "stages": {"imitate": 398.3},
-        }
-        write_json(folder / f"{preset}-{phase}.json", piece)
-    monkeypatch.setattr(script, "ROOT", tmp_path)
-    text = script.content()
-    for shown in (
-        "| `strong` | 1 | 50.0%",
-        "75.0% [",
-        "<br>+25.0 [",
-        "| **pick** | the paper | 90.2% |",
-        "|  | `film` | not run | not run | not run |\n|  | `strong` | 75.0% [",
-        "| pick | `strong` | 1 | 15 | 0 | 0 | 5 | 0 | 0 |",
-        "| phase 2 alone | pick | `strong` | 1 | 2 | 0 | 0 | 0 |",
-        "| pick | `strong` | 1 | 1 | 3 |",
-        "|  | `paper`, paid for goals | 1 | as above | 75.0% [",
-        "| phase 2 alone | pick | `paper`, paid for goals | 1 | 2 | 0 | 0 | 0 |",
-        "13.0% [10.3,\u00a016.2]",
-    ):
-        assert shown in text
-    [row] = [line for line in text.splitlines() if "| `strong` | 1 | 50.0%" in line]
-    first, second = row.split(" | ")[3:5]
-    assert "†" not in first and "]†<br>" in second
-    assert text.count("† made with other options than `reproduce` says today") == 1
-    assert "‡" not in text
-    again = read_json(folder / "paper-goal-pairs-5000.json")
-    again["results"]["phase1"]["outcomes"] = "e0"
-    write_json(folder / "paper-goal-pairs-5000.json", again)
-    # One imitation, looked at on two machines, which round otherwise.
-    assert "‡" not in script.content()
-    again["stages"]["imitate"] = 401.2  # phase 1 was made again, and another came of it
-    write_json(folder / "paper-goal-pairs-5000.json", again)
-    text = script.content()
-    assert "|  | `paper`, paid for goals | 1 | as above | 75.0% [" in text
-    assert "]‡<br>+37.5 [" in text and "‡ with a seed that practised from another phase 1" in text
+    phases = ("phase-1", "pairs-5000", "goal-continued", "zero-shot", "zero-shot-unseen")
+    for task, preset, phase in product(make_tables.TASKS, make_tables.PRESETS, phases):
+        run = piece(task, measured, network=preset, variant=phase)
+        write_json(results / "tables" / f"{task}-{preset}-{phase}.json", run)
+    pick = make_tables.TASKS.index("pick")
+    row = make_tables.table_2()[pick]
+    assert row["the paper, 1"] == "13.0% [10.3, 16.2]"
+    assert row["the paper, best 2"].startswith("15.4% [")
+    assert row["`strong`, 1"].startswith("50.0% [") and row["`strong`, 2"].startswith("75.0% [")
+    row = make_tables.gain_rows()[pick]
+    assert row["`paper`, 5,000 pairs"].startswith("+25.0 [")
+    assert row["`paper`, 10,000 pairs"] == row["paid for goals"] == "not run"
+    assert row["imitation continued"].startswith("+12.5 [")
+    assert make_tables.table_3()[pick] == {
+        "task": "pick",
+        "the paper": "90.2%",
+        "`paper`": "75.0% [75.0, 75.0]",
+        "`paper`, served": "80.0%",
+        "`strong`": "75.0% [75.0, 75.0]",
+        "`strong`, served": "80.0%",
+        "can be served": "90.0%",
+    }
+    row = make_tables.zero_shot()[pick]
+    assert row["the paper, 1 / 2"] == "11.2% / 14.6%"
+    assert row["`paper`, new / other pairs"].endswith("] / 90.0%")
+    row = make_tables.counts("phase-1", "paper", make_tables.wrong_choices)[pick]
+    assert (row["seeds"], row["missing"], row["occupied"]) == (1, "15", "0")
+    row = make_tables.counts("pairs-5000", "paper", make_tables.changes)[pick]
+    assert (row["stuck"], row["both, other / same path"]) == ("2 / 0", "1 / 3")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 
 import numpy as np
@@ -11,17 +12,18 @@ from PIL import Image
 from tensordict.nn import TensorDictModule
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation import Episode, success_rate, suitable_rate
+from ifo_grounding.evaluation import Episode, suitable_rate
+from ifo_grounding.evaluation.tracing import Trace
 from ifo_grounding.report import (
     Case,
     animation,
-    changed_scenes,
     gallery,
     improved_episodes,
     instruction_cases,
-    save_animation,
+    trace_animation,
 )
-from ifo_grounding.report.drawing import BAD, BORDER, GOOD, PADDING, RUNNING, wrapped
+from ifo_grounding.report.drawing import BORDER, PADDING, wrapped
+from ifo_grounding.report.theme import BAD, GOOD, RUNNING
 from ifo_grounding.tasks import grammar
 
 
@@ -87,15 +89,13 @@ def test_captions_are_wrapped_not_cut():
     assert len(lines) > 1 and " ".join(lines) == text
 
 
-def test_animation_refusals(tmp_path):
+def test_animation_refusals():
     with pytest.raises(UserError, match="at least one episode"):
         animation([])
     with pytest.raises(UserError, match="one per episode"):
         animation([episode([(0, 0, 0)] * 2, True)], titles=["a", "b"])
     with pytest.raises(UserError, match=r"uint8 \[3, H, W\]"):
         animation([Episode(np.zeros((2, 48, 48, 3)), np.array([5]), "a", True, True, 0)])
-    path = save_animation(tmp_path / "a.gif", [episode([(0, 0, 0)] * 2, True)])
-    assert path.read_bytes()[:6] == b"GIF89a"
 
 
 def test_gallery_marks_the_unsuitable():
@@ -128,22 +128,29 @@ def test_cases_agree_with_the_suitable_rate():
     assert none == []
 
 
-def test_scenes_that_only_the_second_policy_solves():
+def test_both_policies_play_the_same_scenes():
     def stop(td):
         return td.set("action", torch.full(td.shape, 5))
 
     def up(td):
         return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
 
-    before = success_rate(stop, "move", episodes=150)
-    after = success_rate(up, "move", episodes=150)
-    scenes = changed_scenes(before, after)
-    assert scenes == after.outcomes.nonzero().squeeze(-1).tolist()
-    assert changed_scenes(before, after, improved=False) == []
-    episodes, titles = improved_episodes(stop, up, "move", scenes[:2])
+    episodes, titles = improved_episodes(stop, up, "move", [3, 1], max_steps=2)
     assert titles == ["phase 1", "phase 1", "phase 2", "phase 2"]
-    assert [e.success for e in episodes] == [False, False, True, True]
-    assert [e.scene for e in episodes] == scenes[:2] * 2
-    other = success_rate(stop, "move", episodes=150, seed=1)
-    with pytest.raises(UserError, match="different scenes"):
-        changed_scenes(before, other)
+    assert [e.scene for e in episodes] == [3, 1, 3, 1]
+    assert [int(e.actions[0]) for e in episodes] == [5, 5, 0, 0]
+
+
+def test_a_step_is_a_picture_and_a_dollar_sign_no_formula():
+    shown = episode([(9, 9, 9)] * 3, success=True)
+    shown = dataclasses.replace(shown, sentence=r"pay $\frac for the red $ circle " * 5)
+    trace = Trace(
+        episode=shown,
+        probabilities=np.full((2, 3), 1 / 3, np.float32),
+        maps=np.full((2, 2, 6, 6), 1 / 36, np.float32),
+        rewards={"$^": np.full(2, 0.5, np.float32)},
+    )
+    shown.actions[:] = 1
+    frames, _ = frames_of(trace_animation(trace, actions=["$_", "go", "$}"]))
+    assert len(frames) == 2
+    assert frames_of(animation([shown], actions=["$_", "$^"]))

@@ -29,7 +29,8 @@ def test_text_table():
 
 
 def test_markdown_table():
-    assert markdown_table(ROWS, ["task", "success"]) == "\n".join(
+    rows = [{name: row[name] for name in ("task", "success")} for row in ROWS]
+    assert markdown_table(rows) == "\n".join(
         [
             "| task | success |",
             "| --- | ---: |",

@@ -1,52 +1,35 @@
 """Showing what was learned: tables, plots, animations, case studies, and one page with all."""
 
-from ifo_grounding.report.animation import animation, save_animation
+from ifo_grounding.report.animation import animation
 from ifo_grounding.report.audit import audit_figure
-from ifo_grounding.report.casestudy import (
-    Case,
-    changed_scenes,
-    gallery,
-    improved_episodes,
-    instruction_cases,
-)
-from ifo_grounding.report.metrics import read_metrics
+from ifo_grounding.report.casestudy import Case, gallery, instruction_cases
 from ifo_grounding.report.page import write_report
 from ifo_grounding.report.plots import (
-    confusion,
-    figure_png,
-    phase_bars,
-    save_figure,
+    rates_by_number,
+    reliability_diagram,
     success_over_iterations,
     training_curves,
 )
 from ifo_grounding.report.provenance import provenance
-from ifo_grounding.report.rates import compared_rates, rates_by_number, reliability_diagram
 from ifo_grounding.report.results import results_rows, results_table
 from ifo_grounding.report.tables import format_cell, markdown_table, text_table
+from ifo_grounding.report.theme import figure_png
 from ifo_grounding.report.tracing import trace_animation
 
 __all__ = [
     "Case",
     "animation",
     "audit_figure",
-    "changed_scenes",
-    "compared_rates",
-    "confusion",
     "figure_png",
     "format_cell",
     "gallery",
-    "improved_episodes",
     "instruction_cases",
     "markdown_table",
-    "phase_bars",
     "provenance",
     "rates_by_number",
-    "read_metrics",
     "reliability_diagram",
     "results_rows",
     "results_table",
-    "save_animation",
-    "save_figure",
     "success_over_iterations",
     "text_table",
     "trace_animation",

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from pathlib import Path
 
 from PIL import Image
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.recording import Episode
-from ifo_grounding.files import atomic_write
-from ifo_grounding.report.drawing import BAD, GOOD, RUNNING, Cell, Sheet
+from ifo_grounding.report.drawing import Cell, draw_sheet
+from ifo_grounding.report.theme import BAD, GOOD, RUNNING
 
 COLOURS = 128
 """Colours of an animation; the world has a few dozen."""
@@ -56,33 +55,20 @@ def animation(
         raise UserError("an animation needs at least one episode")
     if titles is not None and len(titles) != len(episodes):
         raise UserError(f"titles must be one per episode, got {len(titles)} of {len(episodes)}")
-    sheet = Sheet(
-        [episode.sentence for episode in episodes],
-        columns=columns,
-        width=width,
-        titled=titles is not None,
-    )
     count = 1 + max(int(max(e.actions, default=0)) for e in episodes)
     names = keys.action_names(max(count, keys.N_ACTIONS)) if actions is None else actions
     if len(names) < count:
         raise UserError(f"there are {count} actions and {len(names)} names: name all of them")
-    labels = titles or [""] * len(episodes)
-    steps = max(len(episode.frames) for episode in episodes)
+    titled = list(zip(episodes, titles or [""] * len(episodes), strict=True))
     pictures = [
-        sheet.draw(
-            [_cell(e, label, step, names) for e, label in zip(episodes, labels, strict=True)]
+        draw_sheet(
+            [_cell(episode, title, step, names) for episode, title in titled],
+            columns=columns,
+            width=width,
         )
-        for step in range(steps)
+        for step in range(max(len(episode.frames) for episode in episodes))
     ]
     return gif(pictures, fps, hold)
-
-
-def save_animation(path: str | Path, episodes: Sequence[Episode], **options: object) -> Path:
-    """Write :func:`animation` to a file, atomically; options are the same."""
-    content = animation(episodes, **options)  # type: ignore[arg-type]
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content)
-    return Path(path)
 
 
 def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Cell:

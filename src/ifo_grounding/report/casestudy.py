@@ -11,19 +11,17 @@ import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
-from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation.recording import Episode, record_episodes
-from ifo_grounding.evaluation.success import SuccessResult
 from ifo_grounding.evaluation.suitability import NOT_SERVED, checked_choices, read_pool
-from ifo_grounding.report.drawing import BAD, GOOD, Cell, Sheet
+from ifo_grounding.report.drawing import Cell, draw_sheet
+from ifo_grounding.report.theme import BAD, GOOD
 from ifo_grounding.tasks.goals import REASONS
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import render
 
 PICTURE_TILE_SIZE = 32
+"""Pixels along one side of a cell in the pictures of cases."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,6 @@ def instruction_cases(
     count: int = 12,
     unsuitable: int | None = None,
     search: int = 512,
-    picture_tile_size: int = PICTURE_TILE_SIZE,
     **options: Any,
 ) -> list[Case]:
     """Return instructions that a classifier chose, with the oracle's verdicts: the suitable first.
@@ -62,7 +59,6 @@ def instruction_cases(
         count: how many cases at most.
         unsuitable: how many of them may be unsuitable; a third by default.
         search: states among which to look for cases.
-        picture_tile_size: pixels along one side of a cell in the pictures.
         options: of :func:`~ifo_grounding.evaluation.suitable_rate`, such as ``threshold``.
     """
     judged = checked_choices(classifier, task, pool, states=search, **options)
@@ -74,7 +70,7 @@ def instruction_cases(
     assert not any(judged.verdict[row] == NOT_SERVED for row in rows)
     if not rows:
         return []
-    pictures = render(judged.state[torch.tensor(rows)], picture_tile_size).cpu().numpy()
+    pictures = render(judged.state[torch.tensor(rows)], PICTURE_TILE_SIZE).cpu().numpy()
     sentences = VOCABULARY.decode(tokens[judged.chosen[rows].cpu()])
     return [
         Case(
@@ -96,52 +92,10 @@ def gallery(cases: Sequence[Case], *, columns: int = 4, width: int = 200) -> byt
     """
     if not cases:
         raise UserError("a gallery needs at least one case")
-    sheet = Sheet([case.sentence for case in cases], columns=columns, width=width)
     cells = [
         Cell(case.picture, case.sentence, note=case.note, colour=GOOD if case.good else BAD)
         for case in cases
     ]
     buffer = io.BytesIO()
-    sheet.draw(cells).save(buffer, format="PNG")
+    draw_sheet(cells, columns=columns, width=width).save(buffer, format="PNG")
     return buffer.getvalue()
-
-
-def changed_scenes(
-    before: SuccessResult, after: SuccessResult, *, improved: bool = True
-) -> list[int]:
-    """Return the scenes that the first policy fails and the second solves, or the other way.
-
-    Raises:
-        UserError: where the results are about different scenes.
-    """
-    if before.scenes != after.scenes:
-        raise UserError("the two results are about different scenes: use the same seed and stream")
-    won, lost = (after, before) if improved else (before, after)
-    changed = won.outcomes & ~lost.outcomes
-    return [int(scene) for scene in changed.nonzero().squeeze(-1)]
-
-
-def improved_episodes(
-    first: Policy,
-    second: Policy,
-    env_or_task: EnvBase | str,
-    scenes: Sequence[int],
-    **options: Any,
-) -> tuple[list[Episode], list[str]]:
-    """Play scenes with both policies, for :func:`~ifo_grounding.report.animation`.
-
-    Args:
-        first: the policy of phase 1.
-        second: the policy of phase 2.
-        env_or_task: where, as for :func:`~ifo_grounding.evaluation.record_episodes`.
-        scenes: which, such as ``changed_scenes(before, after)[:4]``.
-        options: of :func:`~ifo_grounding.evaluation.record_episodes`; ``seed`` and ``stream`` as
-            for the results that the scenes come from.
-
-    Returns:
-        Episodes, all of the first policy and then all of the second, and a title for each: with
-        ``columns=len(scenes)`` both tries of a scene are in one column.
-    """
-    tries = [record_episodes(policy, env_or_task, scenes, **options) for policy in (first, second)]
-    titles = [f"phase {phase}" for phase in (1, 2) for _ in scenes]
-    return [*tries[0], *tries[1]], titles

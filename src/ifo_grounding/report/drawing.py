@@ -12,10 +12,7 @@ from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
 from ifo_grounding.errors import UserError
-
-PAPER, INK, FAINT = "#FFFFFF", "#1F2328", "#59636E"
-GOOD, BAD, RUNNING = "#009E73", "#D55E00", "#B6BEC7"
-"""Colours that stay apart for colour-blind readers; words say the same."""
+from ifo_grounding.report.theme import FAINT, INK, PAPER, RUNNING
 
 BORDER, PADDING, TEXT_SIZE, LINE = 4, 8, 14, 19
 
@@ -70,60 +67,43 @@ def wrapped(text: str, width: int) -> list[str]:
     return lines
 
 
-class Sheet:
-    """Draws captioned pictures of one size in a grid.
+def draw_sheet(cells: Sequence[Cell], *, columns: int, width: int) -> Image.Image:
+    """Draw captioned pictures of one size in a grid.
 
     Args:
-        captions: all captions that will be shown, for the height of the cells.
+        cells: what to draw; cells with the same captions and titles make sheets of the same size.
         columns: cells side by side.
         width: about how wide a picture is drawn, in pixels.
-        titled: whether cells have titles.
-        noted: whether cells have notes.
     """
+    columns = max(1, min(columns, len(cells)))
+    lines = max(len(wrapped(cell.caption, width)) for cell in cells)
+    titled, noted = (any(texts) for texts in zip(*((c.title, c.note) for c in cells), strict=True))
+    drawn = [_draw_cell(cell, width, LINE * titled, LINE * (lines + noted) + 6) for cell in cells]
+    wide, high = drawn[0].size
+    rows = -(-len(drawn) // columns)
+    size = (columns * (wide + PADDING) + PADDING, rows * (high + PADDING) + PADDING)
+    sheet = Image.new("RGB", size, PAPER)
+    for index, picture in enumerate(drawn):
+        row, column = divmod(index, columns)
+        place = (PADDING + column * (wide + PADDING), PADDING + row * (high + PADDING))
+        sheet.paste(picture, place)
+    return sheet
 
-    def __init__(
-        self,
-        captions: Sequence[str],
-        *,
-        columns: int,
-        width: int = 200,
-        titled: bool = False,
-        noted: bool = True,
-    ) -> None:
-        self.columns = max(1, min(columns, len(captions)))
-        self.width, self.titled, self.noted = width, titled, noted
-        self.lines = max(len(wrapped(caption, width)) for caption in captions)
 
-    def draw(self, cells: Sequence[Cell]) -> Image.Image:
-        """Return the grid of cells."""
-        drawn = [self._cell(cell) for cell in cells]
-        wide, high = drawn[0].size
-        rows = -(-len(drawn) // self.columns)
-        size = (self.columns * (wide + PADDING) + PADDING, rows * (high + PADDING) + PADDING)
-        sheet = Image.new("RGB", size, PAPER)
-        for index, picture in enumerate(drawn):
-            row, column = divmod(index, self.columns)
-            sheet.paste(
-                picture, (PADDING + column * (wide + PADDING), PADDING + row * (high + PADDING))
-            )
-        return sheet
-
-    def _cell(self, cell: Cell) -> Image.Image:
-        picture = upscaled(cell.frame, self.width)
-        top = LINE if self.titled else 0
-        wide = max(picture.width, self.width) + 2 * BORDER
-        below = LINE * (self.lines + self.noted) + 6
-        canvas = Image.new("RGB", (wide, top + picture.height + 2 * BORDER + below), PAPER)
-        draw = ImageDraw.Draw(canvas)
-        if self.titled:
-            draw.text((0, 0), cell.title, FAINT, font(bold=True))
-        edge = (0, top, picture.width + 2 * BORDER - 1, top + picture.height + 2 * BORDER - 1)
-        draw.rectangle(edge, fill=cell.colour)
-        canvas.paste(picture, (BORDER, top + BORDER))
-        y = top + picture.height + 2 * BORDER + 4
-        for line in wrapped(cell.caption, self.width):
-            draw.text((0, y), line, INK, font())
-            y += LINE
-        if cell.note:
-            draw.text((0, y), cell.note, cell.colour, font(bold=True))
-        return canvas
+def _draw_cell(cell: Cell, width: int, above: int, below: int) -> Image.Image:
+    """Draw one picture with pixels above it for the title, and below it for caption and note."""
+    picture = upscaled(cell.frame, width)
+    framed = (picture.width + 2 * BORDER, picture.height + 2 * BORDER)
+    size = (max(framed[0], width + 2 * BORDER), above + framed[1] + below)
+    canvas = Image.new("RGB", size, PAPER)
+    draw = ImageDraw.Draw(canvas)
+    draw.text((0, 0), cell.title, FAINT, font(bold=True))
+    draw.rectangle((0, above, framed[0] - 1, above + framed[1] - 1), fill=cell.colour)
+    canvas.paste(picture, (BORDER, above + BORDER))
+    y = above + framed[1] + 4
+    for line in wrapped(cell.caption, width):
+        draw.text((0, y), line, INK, font())
+        y += LINE
+    legible = FAINT if cell.colour == RUNNING else cell.colour
+    draw.text((0, y), cell.note, legible, font(bold=True))
+    return canvas

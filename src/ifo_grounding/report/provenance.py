@@ -15,7 +15,7 @@ from ifo_grounding.machine import machine_of, processor
 
 
 def provenance() -> dict[str, Any]:
-    """Return what a reader needs to judge a number: versions, commit and machine, with its GPU.
+    """Return what a number has to be read with: versions, commit and machine, with its GPU.
 
     The commit is that of the source checkout, with ``+`` behind it where files differ from it; an
     installed package has none.

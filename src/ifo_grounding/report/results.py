@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 from torch import Tensor
 
-from ifo_grounding.files import read_json
-from ifo_grounding.report.tables import folded, text_table
+from ifo_grounding.report.tables import text_table
 from ifo_grounding.stats import Difference, Estimate, Rate, wilson
 
-REFERENCES = {"true_actions": "imitation of true actions", "demonstrator": "demonstrator"}
-"""What no learner can or may be, by its name in the results."""
-CONTROLS = {"continued": "imitation continued", "cloned": "accepted rollouts cloned"}
-"""What phase 2 has to beat, by its name in the results."""
+COMPARED = {
+    "continued": "imitation continued, success (control)",
+    "true_actions": "imitation of true actions, success (reference)",
+    "demonstrator": "demonstrator, success (reference)",
+}
+"""What phase 2 is compared with, by its name in the results."""
 Measured = TypeVar("Measured", Rate, Estimate, Difference)
-Key = TypeVar("Key", bound=Hashable)
 
 
 def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -35,42 +34,43 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     >>> [row["measured"] for row in rows]
     ['inverse accuracy', 'inverse accuracy, worst action (P)']
     """
-    rows: list[dict[str, Any]] = []
+    return [
+        {"measured": measured, "result [95% interval]": restored(kind, values)}
+        for measured, kind, values in _measurements(results)
+        if values is not None
+    ]
 
-    def add(measured: str, value: Any) -> None:
-        rows.append({"measured": measured, "result [95% interval]": value})
 
+def _measurements(results: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, kind and plain values of each measurement; None where it was not made."""
     if labels := results.get("labels"):
+        yield "inverse accuracy", Rate, labels["rate"]
         worst = labels["worst"]
-        add("inverse accuracy", restored(Rate, labels["rate"]))
-        add(
-            f"inverse accuracy, worst action ({worst})", restored(Rate, labels["per_action"][worst])
-        )
+        yield f"inverse accuracy, worst action ({worst})", Rate, labels["per_action"][worst]
     for phase in (1, 2):
         if success := results.get(f"phase{phase}"):
-            add(f"phase {phase} success, {success['mode']}", restored(Rate, success["rate"]))
-            if sampled := success.get("sampled"):
-                add(f"phase {phase} success, sampled", restored(Rate, sampled["rate"]))
-    for name, title in CONTROLS.items():
-        if success := results.get(name):
-            add(f"{title}, success (control)", restored(Rate, success["rate"]))
-    if gain := results.get("gain"):
-        add("phase 2 - phase 1, paired, points", restored(Difference, gain))
-    for name, title in REFERENCES.items():
-        if success := results.get(name):
-            add(f"{title}, success (reference)", restored(Rate, success["rate"]))
-    if choices := results.get("suitability"):
-        add("suitable rate of chosen instructions", restored(Rate, choices["rate"]))
-        add("states served", restored(Rate, choices["served"]))
-        if "servable" in choices:
-            add("states that an instruction suits", restored(Rate, choices["servable"]))
-        add("recall of suitable pairs", restored(Rate, choices["recall"]))
-    if reward := results.get("action_reward"):
-        add("action reward against the expert, AUC", restored(Estimate, reward["auc"]))
-    for kind in ("action", "goal"):
-        if audit := results.get(f"{kind}_return"):
-            add(f"{kind} return against true success, AUC", restored(Estimate, audit["auc"]))
-    return rows
+            yield f"phase {phase} success, {success['mode']}", Rate, success["rate"]
+            sampled = success.get("sampled", {}).get("rate")
+            yield f"phase {phase} success, sampled", Rate, sampled
+    yield "phase 2 - phase 1, paired, points", Difference, results.get("gain")
+    for name, title in COMPARED.items():
+        yield title, Rate, results.get(name, {}).get("rate")
+    choices = results.get("suitability") or {}
+    yield "suitable rate of chosen instructions", Rate, choices.get("rate")
+    yield "states served", Rate, choices.get("served")
+    yield "states that an instruction suits", Rate, choices.get("servable")
+    yield "recall of suitable pairs", Rate, choices.get("recall")
+    for name, title in {
+        "action_reward": "action reward against the expert, AUC",
+        "action_return": "action return against true success, AUC",
+        "goal_return": "goal return against true success, AUC",
+    }.items():
+        yield title, Estimate, (results.get(name) or {}).get("auc")
+
+
+def results_table(results: Mapping[str, Any]) -> str:
+    """Return :func:`results_rows` as a table for the terminal."""
+    return text_table(results_rows(results))
 
 
 def restored(kind: type[Measured], values: Mapping[str, Any]) -> Measured:
@@ -93,16 +93,6 @@ def brief(value: Measured) -> str:
     '90.0% [59.6, 98.2]'
     """
     return str(value).rpartition(" (")[0].replace(" points", "")
-
-
-def effective(section: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a section that have an effect: one trial is none.
-
-    >>> effective({"steps": 300, "trials": 1, "trial_steps": 50})
-    {'steps': 300}
-    """
-    alone = ("trials", "trial_steps", "trial_halvings") if section.get("trials", 1) == 1 else ()
-    return {name: value for name, value in section.items() if name not in alone}
 
 
 def packed(outcomes: Tensor) -> str:
@@ -140,52 +130,3 @@ def unpacked(runs: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
         bits = np.unpackbits(np.frombuffer(bytes.fromhex(result["outcomes"]), np.uint8))
         rows.append(bits[: result["rate"]["count"]].astype(bool))
     return np.stack(rows)
-
-
-def read_results(
-    folder: Path, by: Callable[[Mapping[str, Any]], Key]
-) -> dict[Key, list[dict[str, Any]]]:
-    """Read the result files of a folder, in the order of their names: the seeds of each study.
-
-    Args:
-        folder: of ``.json`` files.
-        by: says of the options of a run to which study it belongs.
-    """
-    found: dict[Key, list[dict[str, Any]]] = {}
-    for path in sorted(folder.glob("*.json")):
-        run = read_json(path)
-        found.setdefault(by(run["options"]), []).append(run)
-    return found
-
-
-def same_policy(run: Mapping[str, Any], name: str) -> bool:
-    """Whether another policy of a run is the one of phase 1: what came after was not kept.
-
-    >>> run = {"results": {"phase1": {"mean_length": 5.0}, "phase2": {"mean_length": 5.0}}}
-    >>> same_policy(run, "phase2")
-    True
-    """
-    results = run["results"]
-    return results[name] == results["phase1"]
-
-
-def commands_note(groups: Iterable[Sequence[Mapping[str, Any]]]) -> str:
-    """Return by which command each run was made, at which commit, as a note that is folded away.
-
-    >>> run = {"command": "ifo-grounding run study", "provenance": {"commit": "abc"}}
-    >>> commands_note([[run]]).splitlines()[-1].strip()
-    '- `ifo-grounding run study` (commit `abc`)'
-    """
-    made = [f"- `{run['command']}` ({_made_by(run)})" for runs in groups for run in runs]
-    return folded("Commands", list(dict.fromkeys(made)))
-
-
-def _made_by(run: Mapping[str, Any]) -> str:
-    made = run["provenance"]
-    commit = f"commit `{made['commit']}`"
-    return f"{commit}; {made['renamed']}" if "renamed" in made else commit
-
-
-def results_table(results: Mapping[str, Any]) -> str:
-    """Return :func:`results_rows` as a table for the terminal."""
-    return text_table(results_rows(results))

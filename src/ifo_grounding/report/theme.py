@@ -1,58 +1,87 @@
-"""Colours of plots, and their dark version."""
+"""How figures look: colours that colour-blind readers can tell apart, and plain axes.
+
+Nothing here touches matplotlib's global state or needs a display.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import io
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import same_color, to_rgba
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.text import Text
+from matplotlib.ticker import PercentFormatter
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 """Okabe and Ito's colours, the clearest first."""
-
-_ON_DARK = ("#4BA3E3", "#F4843C", "#2EC4A0", "#E6A3CC", "#8CCBF2", "#F5B942")
-
-LIGHT = {"paper": "#FFFFFF", "ink": "#1F2328", "faint": "#59636E", "grid": "#E4E7EB"}
-DARK = {"paper": "#161B22", "ink": "#E6EDF3", "faint": "#9DA7B3", "grid": "#2D333B"}
-LIGHT |= {f"series {i}": colour for i, colour in enumerate(PALETTE)}
-DARK |= {f"series {i}": colour for i, colour in enumerate(_ON_DARK)}
+GOOD, BAD, RUNNING = "#009E73", "#D55E00", "#B6BEC7"
+"""Of episodes and choices; words say the same."""
+PAPER, INK, FAINT, GRID = "#FFFFFF", "#1F2328", "#59636E", "#E4E7EB"
 
 
-@contextmanager
-def in_theme(figure: Figure, theme: str) -> Iterator[None]:
-    """Swap the colours of a figure for those of the dark theme, and back."""
-    if theme == "light":
-        yield
-        return
-    _swap(figure, LIGHT, DARK)
-    try:
-        yield
-    finally:
-        _swap(figure, DARK, LIGHT)
+def new_figure(
+    width: float, height: float, rows: int = 1, columns: int = 1
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure of some inches and its axes, [rows, columns]."""
+    figure = Figure(figsize=(width, height), facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _swap(figure: Figure, old: Mapping[str, str], new: Mapping[str, str]) -> None:
-    def renewed(colour: Any) -> tuple[float, ...] | None:
-        red, green, blue, alpha = to_rgba(colour)
-        rgb = (red, green, blue)
-        role = next((role for role in old if alpha and same_color(rgb, old[role])), None)
-        return None if role is None else to_rgba(new[role], alpha)
+def new_panels(
+    count: int, width: float, height: float, columns: int = 2
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure and its axes, each of some inches, so many side by side."""
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    figure, grid = new_figure(width * columns + 0.4, height * rows + 0.2, rows, columns)
+    for axes in grid.flat[count:]:
+        axes.set_visible(False)
+    return figure, list(grid.flat[:count])
 
-    for axes in figure.axes:
-        # Ticks are rebuilt from these parameters whenever the figure is drawn.
-        axes.tick_params(colors=new["faint"], grid_color=new["grid"])
-    for artist in figure.findobj():
-        for name in ("color", "facecolor", "edgecolor", "markeredgecolor", "markerfacecolor"):
-            getter = getattr(artist, f"get_{name}", None)
-            if getter is None or (name == "color" and not isinstance(artist, (Text, Line2D))):
-                continue
-            value = getter()
-            if isinstance(value, np.ndarray) and value.ndim == 2:  # a collection: a row per member
-                value = value[0] if len(value) == 1 else None
-            if value is not None and (colour := renewed(value)):
-                getattr(artist, f"set_{name}")(colour)
+
+def dress(axes: Axes, title: str = "", x: str = "", y: str = "", grid: str = "y") -> None:
+    """Give axes a title, labels and a faint grid along ``grid``: x, y, both or none of them."""
+    axes.set_title(title, loc="left", fontsize=11, fontweight="bold", color=INK)
+    axes.set_xlabel(x, color=FAINT)
+    axes.set_ylabel(y, color=FAINT)
+    axes.tick_params(colors=FAINT, length=0, labelsize=9)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side == "bottom" and grid == "y")
+        spine.set_color(FAINT)
+    if grid:
+        axes.grid(axis=grid, color=GRID, linewidth=0.8)  # type: ignore[arg-type]
+    axes.set_axisbelow(True)
+
+
+def in_percent(axes: Axes, low: float = 0.0) -> None:
+    """Show shares from ``low`` to 1 on the vertical axis as percentages."""
+    axes.set_ylim(low, 1.02)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+
+
+def add_legend(of: Axes | Figure, **options: Any) -> None:
+    """Add a legend without a frame; options are matplotlib's."""
+    of.legend(frameon=False, labelcolor=INK, fontsize=9, **options)
+
+
+def without_formulas(figure: Figure) -> None:
+    """Show every ``$`` of a figure's texts as it is: instructions and names hold no formulas."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+
+
+def figure_png(figure: Figure, *, dpi: int = 150) -> bytes:
+    """Return a figure as PNG.
+
+    >>> figure, _ = new_figure(2.0, 1.0)
+    >>> figure_png(figure)[1:4]
+    b'PNG'
+    """
+    without_formulas(figure)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()

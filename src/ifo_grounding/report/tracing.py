@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,11 +17,21 @@ from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.tracing import Trace
 from ifo_grounding.report.animation import gif
-from ifo_grounding.report.plots import _dress, _figure
-from ifo_grounding.report.theme import LIGHT, PALETTE
+from ifo_grounding.report.theme import (
+    FAINT,
+    INK,
+    PALETTE,
+    RUNNING,
+    add_legend,
+    dress,
+    new_figure,
+    without_formulas,
+)
 
 MAPS = 8
 """Maps that are shown: the sharpest ones."""
+SENTENCE_WIDTH = 70
+"""Letters of the instruction on one line."""
 
 
 def trace_animation(
@@ -33,8 +44,8 @@ def trace_animation(
 ) -> bytes:
     """Return a GIF of an episode, step by step.
 
-    Each picture has what the policy sees, the instruction, the probability of each action, what
-    the judges have said so far, and where the sharpest maps look.
+    Each picture has what the policy sees, the instruction, the probability of each action, the
+    learned rewards so far, and the cells that the sharpest attention maps weigh.
 
     Args:
         trace: from :func:`~ifo_grounding.evaluation.trace_episode`.
@@ -74,34 +85,67 @@ class _Board:
 
     def __init__(self, trace: Trace, maps: np.ndarray, actions: Sequence[str]) -> None:
         self.trace, self.chosen, self.names = trace, maps, actions
-        self.figure, _ = _figure(7.6, 5.4)
+        self.figure, _ = new_figure(7.6, 5.4)
         self.figure.clear()
-        sentence = trace.episode.sentence
-        self.figure.suptitle(sentence, fontsize=12, fontweight="bold", color=LIGHT["ink"])
+        sentence = textwrap.fill(trace.episode.sentence, SENTENCE_WIDTH)
+        self.figure.suptitle(sentence, fontsize=12, fontweight="bold", color=INK)
         rows = self.figure.add_gridspec(2, 1, height_ratios=(3, 1.15))
         top = rows[0].subgridspec(1, 3 if trace.rewards else 2)
         self.seen = self.figure.add_subplot(top[0])
-        self.shown = [self._image(self.seen)]
+        self.frames = [self._frame(self.seen)]
         self.bars = self._actions(self.figure.add_subplot(top[1]))
-        self.lines = self._judges(self.figure.add_subplot(top[2])) if trace.rewards else []
+        self.lines = self._rewards(self.figure.add_subplot(top[2])) if trace.rewards else []
         below = rows[1].subgridspec(1, max(len(maps), 1))
         self.weights = [
             self._map(self.figure.add_subplot(below[place]), int(number))
             for place, number in enumerate(maps)
         ]
+        without_formulas(self.figure)
+
+    def _frame(self, axes: Axes, alpha: float = 1.0) -> AxesImage:
+        frame = self.trace.episode.frames[0]
+        height, width = frame.shape[-2:]
+        axes.set(xticks=[], yticks=[])
+        return axes.imshow(frame.transpose(1, 2, 0), alpha=alpha, extent=(0, width, height, 0))
+
+    def _actions(self, axes: Axes) -> BarContainer:
+        dress(axes, "Probability of actions", grid="x")
+        bars = axes.barh(range(len(self.names)), self.trace.probabilities[0])
+        axes.set_yticks(range(len(self.names)), self.names)
+        axes.invert_yaxis()
+        axes.set_xlim(0, 1)
+        return bars
+
+    def _rewards(self, axes: Axes) -> list[Line2D]:
+        dress(axes, "Learned rewards", "step")
+        lines = [
+            axes.plot([], [], color=colour, marker="o", markersize=3, label=name)[0]
+            for name, colour in zip(self.trace.rewards, PALETTE, strict=False)
+        ]
+        axes.set(ylim=(-0.03, 1.03), xlim=(0.5, len(self.trace.episode.actions) + 0.5))
+        add_legend(axes, loc="upper left")
+        return lines
+
+    def _map(self, axes: Axes, number: int) -> AxesImage:
+        dress(axes, grid="")
+        axes.set_title(f"map {number + 1}", fontsize=8, color=FAINT)
+        self.frames.append(self._frame(axes, alpha=0.35))
+        extent = self.frames[-1].get_extent()
+        weights = self.trace.maps[0, number]
+        return axes.imshow(weights, cmap="Oranges", vmin=0, vmax=1, extent=extent)
 
     def picture(self, step: int) -> Image.Image:
-        """Draw a step: what is seen, likely, judged and attended to."""
+        """Draw one step: frame, probabilities of actions, learned rewards and maps."""
         episode = self.trace.episode
         ended = step == len(episode.actions) - 1
         ending = f", {'success' if episode.success else 'failure'}" if ended else ""
         action = int(episode.actions[step])
-        _dress(self.seen, f"Step {step + 1}: {self.names[action]}{ending}", grid="")
-        for image in self.shown:
+        dress(self.seen, f"Step {step + 1}: {self.names[action]}{ending}", grid="")
+        for image in self.frames:
             image.set_data(episode.frames[step].transpose(1, 2, 0))
         for number, bar in enumerate(self.bars):
             bar.set_width(self.trace.probabilities[step, number])
-            bar.set_color(PALETTE[0] if number == action else "#B6BEC7")
+            bar.set_color(PALETTE[0] if number == action else RUNNING)
         for line, values in zip(self.lines, self.trace.rewards.values(), strict=True):
             line.set_data(np.arange(1, step + 2), values[: step + 1])
         for image, number in zip(self.weights, self.chosen, strict=True):
@@ -114,37 +158,3 @@ class _Board:
         canvas.draw()
         self.figure.set_layout_engine("none")  # to lay it out once is enough
         return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
-
-    def _image(self, axes: Axes, alpha: float = 1.0) -> AxesImage:
-        frame = self.trace.episode.frames[0]
-        height, width = frame.shape[-2:]
-        axes.set_xticks([])
-        axes.set_yticks([])
-        return axes.imshow(frame.transpose(1, 2, 0), alpha=alpha, extent=(0, width, height, 0))
-
-    def _actions(self, axes: Axes) -> BarContainer:
-        _dress(axes, "Probability of actions", grid="x")
-        bars = axes.barh(range(len(self.names)), self.trace.probabilities[0])
-        axes.set_yticks(range(len(self.names)), self.names)
-        axes.invert_yaxis()
-        axes.set_xlim(0, 1)
-        return bars
-
-    def _judges(self, axes: Axes) -> list[Line2D]:
-        _dress(axes, "What the judges say", "step", grid="y")
-        lines = [
-            axes.plot([], [], color=colour, marker="o", markersize=3, label=name)[0]
-            for name, colour in zip(self.trace.rewards, PALETTE, strict=False)
-        ]
-        axes.set_ylim(-0.03, 1.03)
-        axes.set_xlim(0.5, len(self.trace.episode.actions) + 0.5)
-        axes.legend(frameon=False, fontsize=9, loc="upper left", labelcolor=LIGHT["ink"])
-        return lines
-
-    def _map(self, axes: Axes, number: int) -> AxesImage:
-        _dress(axes, grid="")
-        axes.set_title(f"map {number + 1}", fontsize=8, color=LIGHT["faint"])
-        self.shown.append(self._image(axes, alpha=0.35))
-        weights = self.trace.maps[0, number]
-        extent = self.shown[-1].get_extent()
-        return axes.imshow(weights, cmap="Oranges", vmin=0, vmax=1, extent=extent)
