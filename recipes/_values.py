@@ -7,7 +7,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from ifo_grounding.errors import UserError, whole
-from ifo_grounding.objectives.pairs import ESTIMATED
+
+ESTIMATED = "estimated"
 
 AT_LEAST_ONE = (
     "threads",

@@ -42,7 +42,7 @@ def imitation(options: DictConfig, seed: int) -> ImitationLoss:
     """Return the loss of a policy with the initial weights of a seed."""
     context = context_of(options, "imitate")
     policy = build(make_policy, options, seed=seed, context=context)
-    return ImitationLoss(policy, strict_from=options.imitate.get("strict_from", 0.0))
+    return ImitationLoss(policy, words_from=options.imitate.get("strict_from", 0.0))
 
 
 def best_beginning(

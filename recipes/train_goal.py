@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.data import goal_buffer
-from ifo_grounding.networks import make_goal_judge
+from ifo_grounding.networks import make_goal_classifier
 from ifo_grounding.objectives import GoalLoss
 
 
@@ -22,7 +22,7 @@ def train_goal(options: DictConfig) -> dict:
     policy = starting_policy(stage.run, options, "goal")
     context = context_of(options, "goal")
     loss = GoalLoss(
-        build(make_goal_judge, options, init_from=policy, context=context),
+        build(make_goal_classifier, options, init_from=policy, context=context),
         demos.pool(),
         negatives=options.goal.negatives,
         removal_rate=options.goal.removal_rate,

@@ -34,8 +34,9 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.evaluation import episode_endings, probe
 from ifo_grounding.evaluation.endings import SUCCESS
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
-from ifo_grounding.networks.looks import EVIDENCE, Looks
-from ifo_grounding.networks.transfer import trunk_of
+from ifo_grounding.networks.appearance import EVIDENCE
+from ifo_grounding.networks.appearance import Appearance as Looks
+from ifo_grounding.networks.warm_start import trunk_of
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.report import text_table
 from ifo_grounding.report.results import brief, by_scene, restored
@@ -75,7 +76,7 @@ def one_way(trunk: GroundedTrunk, loss: ImitationLoss) -> None:
 
 
 def no_charge(trunk: GroundedTrunk, loss: ImitationLoss) -> None:
-    loss.charge = 0.0
+    loss.word_penalty = 0.0
 
 
 def no_swaps(trunk: GroundedTrunk, loss: ImitationLoss) -> None:

@@ -7,7 +7,7 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import probe
 from ifo_grounding.networks import make_policy
-from ifo_grounding.networks.transfer import trunk_of
+from ifo_grounding.networks.warm_start import trunk_of
 
 
 def policy(preset):

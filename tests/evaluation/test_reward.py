@@ -14,7 +14,7 @@ from ifo_grounding.data import record_demonstrations
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import return_correlation, reward_audit
-from ifo_grounding.networks import make_goal_judge, make_policy, make_reward_model
+from ifo_grounding.networks import make_goal_classifier, make_policy, make_reward_model
 from ifo_grounding.transforms import LearnedReward
 
 
@@ -91,7 +91,7 @@ def test_actions_without_a_name_are_refused(recorded):
     with pytest.raises(UserError, match="of 3 with a name"):
         reward_audit(judge, demos, truth, names="LRS")
     with pytest.raises(UserError, match="judges 6 actions, not 7"):
-        reward_audit(make_reward_model(demos, "film", seed=0), demos, truth, names="URDLPSX")
+        reward_audit(make_reward_model(demos, "paper", seed=0), demos, truth, names="URDLPSX")
     with pytest.raises(UserError, match="at least 1"):
         reward_audit(judge, demos, truth, transitions=0)
 
@@ -142,7 +142,7 @@ def test_real_models_of_both_kinds(recorded):
     policy = make_policy(demos, "paper", seed=0)
     for pay in (
         make_reward_model(demos, "paper", seed=0),
-        LearnedReward(make_goal_judge(demos, "paper", seed=0), kind="goal"),
+        LearnedReward(make_goal_classifier(demos, "paper", seed=0), kind="goal"),
     ):
         audit = return_correlation(policy, pay, "move", episodes=100)
         assert torch.isfinite(audit.returns).all() and (audit.returns >= 0).all()
@@ -151,7 +151,8 @@ def test_real_models_of_both_kinds(recorded):
 
 def test_worlds_in_workers_are_judged(recorded):
     demos, _ = recorded
-    policy, judge = make_policy(demos, "paper", seed=0), make_goal_judge(demos, "paper", seed=0)
+    policy = make_policy(demos, "paper", seed=0)
+    judge = make_goal_classifier(demos, "paper", seed=0)
     worlds = SerialEnv(3, lambda: PickAndPlaceEnv("move", num_envs=2, seed=0))
     audit = return_correlation(
         policy, LearnedReward(judge, kind="goal", stop_action=5), worlds, episodes=8, max_steps=10

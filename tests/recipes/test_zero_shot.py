@@ -59,7 +59,7 @@ def test_variants_leave_a_file_each_and_are_made_once(options, tmp_path):
 def test_each_variant_changes_what_it_says(options):
     from zero_shot import CHANGES, WHOLE, beginning
 
-    from ifo_grounding.networks.transfer import trunk_of
+    from ifo_grounding.networks.warm_start import trunk_of
 
     given = options()
     image = torch.randint(256, (4, 3, 48, 48), dtype=torch.uint8)

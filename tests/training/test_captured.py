@@ -15,7 +15,7 @@ from ifo_grounding.data import (
 )
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import (
-    make_goal_judge,
+    make_goal_classifier,
     make_instruction_classifier,
     make_policy,
     make_reward_model,
@@ -59,13 +59,13 @@ def test_only_steps_that_are_all_the_same_can_be_captured():
 def test_steps_that_count_how_many_negatives_to_drop_are_not_captured():
     demos = record_demonstrations("move", 20, seed=0)
     told = partial(InstructionLoss, make_instruction_classifier(demos, "paper", seed=0))
-    judged = partial(GoalLoss, make_goal_judge(demos, "paper", seed=0))
+    judged = partial(GoalLoss, make_goal_classifier(demos, "paper", seed=0))
     pool = demos.pool()
     assert told(pool, unlabelled="mixture", near=0.5).capturable
     assert told(pool, removal_rate=0.0).capturable
     assert judged(pool).capturable
-    counted = [told(pool), told(pool, removal_rate=0.3), told(pool, unlabelled="non-negative")]
-    counted += [judged(pool, removal_rate="estimated"), judged(pool, generator=torch.Generator())]
+    counted = [told(pool), told(pool, removal_rate=0.3)]
+    counted += [judged(pool, removal_rate=None), judged(pool, generator=torch.Generator())]
     counted += [InstructionLoss(make_instruction_classifier(demos), pool, unlabelled="mixture")]
     assert not any(loss.capturable for loss in counted)
 
@@ -145,7 +145,7 @@ def instruction(demos, truth, **options):
 
 
 def goal(demos, truth, **options):
-    loss = GoalLoss(make_goal_judge(demos, "paper", **options), demos.pool())
+    loss = GoalLoss(make_goal_classifier(demos, "paper", **options), demos.pool())
     return loss, goal_buffer(demos)
 
 

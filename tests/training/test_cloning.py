@@ -5,7 +5,7 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import make_goal_judge, make_instruction_classifier, make_policy
+from ifo_grounding.networks import make_goal_classifier, make_instruction_classifier, make_policy
 from ifo_grounding.seeding import derive
 from ifo_grounding.training import accepted, accepted_steps
 from ifo_grounding.training.environment import make_collector, reseed
@@ -20,9 +20,9 @@ def test_episodes_are_accepted_by_their_own_return():
 
 def practice(bias):
     simulator = PickAndPlaceEnv("move", num_envs=8, seed=0, instructed=False)
-    small = {"features": 16, "n_blocks": 1, "seed": 0}
+    small = {"features": 16, "seed": 0}
     classifier = make_instruction_classifier(simulator, **small)
-    judge = make_goal_judge(simulator, **small)
+    judge = make_goal_classifier(simulator, **small)
     judge.module.prior.fill_(bias)  # accepts everything, or nothing
     pool = torch.randint(1, 20, (4, 16))
     sampler = InstructionSampler(classifier, pool, threshold=0.0)
@@ -51,9 +51,9 @@ def test_worlds_in_workers_are_as_those_side_by_side():
         return PickAndPlaceEnv("move", num_envs=3, seed=seed, instructed=False)
 
     _, policy = practice(0.0)
-    judge = make_goal_judge(world(0), features=16, n_blocks=1, seed=0)
+    judge = make_goal_classifier(world(0), features=16, seed=0)
     judge.module.prior.fill_(50.0)  # a goal is reached whenever the policy stops
-    classifier = make_instruction_classifier(world(0), features=16, n_blocks=1, seed=0)
+    classifier = make_instruction_classifier(world(0), features=16, seed=0)
     sampler = InstructionSampler(classifier, torch.randint(1, 20, (4, 16)), threshold=0.0)
     workers = SerialEnv(2, [lambda: world(0), lambda: world(1)])
     env = TransformedEnv(workers, Compose(sampler, LearnedReward(judge, "goal", stop_action=5)))

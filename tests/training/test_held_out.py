@@ -73,7 +73,7 @@ def test_a_look_leaves_mode_and_randomness_alone():
 
 def test_a_look_leaves_the_network_and_generators_of_its_own_alone():
     demos = record_demonstrations("move", 20, seed=0)
-    classifier = make_instruction_classifier(demos, "film", seed=0).eval()
+    classifier = make_instruction_classifier(demos, "paper", seed=0).eval()
     generator = torch.Generator().manual_seed(7)
     loss = InstructionLoss(classifier, demos.pool(), generator=generator)
     held_out = HeldOut(loss, first_frame_buffer(demos))

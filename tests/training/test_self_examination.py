@@ -29,7 +29,7 @@ from ifo_grounding.training import (
 from ifo_grounding.training.environment import summary
 from ifo_grounding.transforms import InstructionSampler, LearnedReward, StartingPairs
 
-SMALL = {"preset": "film", "n_blocks": 1, "features": 16, "seed": 0}
+SMALL = {"preset": "paper", "dropout": 0.0, "features": 16, "seed": 0}
 POOL = grammar("move").tokens
 
 
@@ -325,7 +325,7 @@ def test_the_adversary_calls_the_policys_actions_wrong():
     assert last["reward/positive_probability"] > last["reward/negative_probability"]
     state = adversary.state_dict()
     other = Adversary(
-        RewardLoss(make_reward_model(simulator(1), n_blocks=1, features=16, seed=1)),
+        RewardLoss(make_reward_model(simulator(1), **{**SMALL, "seed": 1})),
         buffer,
         1,
         1e-3,

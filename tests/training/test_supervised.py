@@ -13,7 +13,7 @@ from ifo_grounding.networks import (
     make_policy,
     make_reward_model,
 )
-from ifo_grounding.networks.transfer import inherited
+from ifo_grounding.networks.warm_start import inherited
 from ifo_grounding.objectives import ImitationLoss, InstructionLoss, RewardLoss
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.training.supervised import total_loss
@@ -38,7 +38,7 @@ def buffer():
 
 def imitation(dropout=0.0):
     return ImitationLoss(
-        make_policy(SHAPES, "film", seed=0, n_blocks=1, features=16, dropout=dropout)
+        make_policy(SHAPES, "paper", seed=0, features=16, dropout=dropout)
     )
 
 
@@ -87,7 +87,7 @@ def test_a_run_goes_on_with_generators_and_rounds_of_its_own(buffer, tmp_path, d
             options = {"sampler": SamplerWithoutReplacement()}
         stored = TensorDictReplayBuffer(storage=LazyTensorStorage(256), **options)
         stored.extend(data)
-        model = make_reward_model(SHAPES, "film", seed=0, n_blocks=1, features=16)
+        model = make_reward_model(SHAPES, "paper", seed=0, features=16)
         return RewardLoss(model, generator=own if drawing == "loss" else None), stored
 
     config = FitConfig(steps=12, batch_size=32, iteration=3)

@@ -17,8 +17,8 @@ from ifo_grounding.evaluation.endings import looks
 from ifo_grounding.evaluation.episodes import device_of
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import GroundedTrunk, attention_maps
-from ifo_grounding.networks.transfer import trunk_of
-from ifo_grounding.networks.trunk import Trunk, encode_instruction
+from ifo_grounding.networks.trunk import GatedTrunk as Trunk
+from ifo_grounding.networks.warm_start import trunk_of
 from ifo_grounding.tasks.grammar import grammar, holdout_kinds
 from ifo_grounding.world import COLOURS, SHAPES
 
@@ -149,7 +149,7 @@ def _objects(trunk: Trunk | GroundedTrunk, scenes: _Scenes) -> tuple[Tensor, Ten
 
 def _sentences(trunk: Trunk, *parts: _Scenes) -> tuple[Tensor, Tensor]:
     """Return encodings [M, D] of all instructions, and the kinds [M] that they are about."""
-    encoded = [encode_instruction(trunk.instruction, part.instruction) for part in parts]
+    encoded = [trunk.instruction(part.instruction) for part in parts]
     return torch.cat(encoded).float(), torch.cat([part.wanted for part in parts])
 
 

@@ -14,7 +14,7 @@ from ifo_grounding import keys
 from ifo_grounding.evaluation.episodes import device_of
 from ifo_grounding.evaluation.recording import Episode
 from ifo_grounding.modules import evaluating, output_key
-from ifo_grounding.networks.attention import attention_maps
+from ifo_grounding.networks import attention_maps
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 
 
@@ -51,11 +51,11 @@ def trace_episode(
 
     >>> from ifo_grounding.envs import PickAndPlaceEnv
     >>> from ifo_grounding.evaluation import record_episodes
-    >>> from ifo_grounding.networks import make_goal_judge, make_policy
+    >>> from ifo_grounding.networks import make_goal_classifier, make_policy
     >>> env = PickAndPlaceEnv("move", num_envs=1)
     >>> policy = make_policy(env, seed=0)
     >>> (episode,) = record_episodes(policy, "move", [0])
-    >>> trace = trace_episode(policy, episode, {"goal": make_goal_judge(env, seed=0)})
+    >>> trace = trace_episode(policy, episode, {"goal": make_goal_classifier(env, seed=0)})
     >>> trace.probabilities.shape[1], trace.maps.shape[1:], sorted(trace.rewards)
     (6, (16, 6, 6), ['goal'])
     """

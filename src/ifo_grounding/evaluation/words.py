@@ -12,7 +12,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.episodes import device_of
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import GroundedTrunk
-from ifo_grounding.networks.transfer import trunk_of
+from ifo_grounding.networks.warm_start import trunk_of
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import COLOURS, N_KINDS, SHAPES, WorldState, kind_name, render
 
@@ -59,7 +59,7 @@ def word_evidence(
     state.arm[0] = N_KINDS
     tokens = VOCABULARY.encode(list(words))[:, 0].to(device)
     with evaluating(policy):
-        looks = trunk.looks(render(state, tile_size))
+        looks = trunk.appearance(render(state, tile_size))
         seen = looks.where[0, :N_KINDS]
         said = [evidence[seen][:, tokens] for evidence in trunk.words.evidence(looks)]
     colour, form = ((evidence - evidence.mean(0)).cpu() for evidence in said)

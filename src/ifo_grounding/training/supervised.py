@@ -16,7 +16,7 @@ from torchrl.data import RandomSampler, ReplayBuffer
 
 from ifo_grounding.errors import UserError, at_least_one, check_numbers
 from ifo_grounding.modules import beside, device_of
-from ifo_grounding.networks.transfer import inherited
+from ifo_grounding.networks.warm_start import inherited
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.captured import CapturedUpdate, Update, let_capture, set_rate
 from ifo_grounding.training.checkpoint import Checkpoint, fingerprint
