@@ -17,7 +17,7 @@ from ifo_grounding.data import (
 )
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.networks import (
-    make_goal_judge,
+    make_goal_classifier,
     make_instruction_classifier,
     make_policy,
     make_reward_model,
@@ -91,7 +91,7 @@ def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
     def losses(device):
         options = {"seed": 0, "device": device, "precision": "fp32"}
         if kind == "goal":
-            loss = GoalLoss(make_goal_judge(demos, "paper", **options), pool, negatives=1)
+            loss = GoalLoss(make_goal_classifier(demos, "paper", **options), pool, negatives=1)
             batch = goal_buffer(demos)[:]
         else:
             network = make_instruction_classifier(demos, "paper", **options)

@@ -1,4 +1,4 @@
-"""What every part does with modules that it is handed: device, eval mode, what they charge for."""
+"""What every part does with modules that it is handed: device, eval mode, outputs, words."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def output_key(module: TensorDictModuleBase, *expected: str) -> NestedKey:
 
     Raises:
         UserError: where ``module`` is no TensorDictModule, it is unclear which output is meant, or
-            it is what another judge says.
+            it is what another network says of pairs or actions.
 
     >>> from tensordict.nn import TensorDictModule
     >>> output_key(TensorDictModule(nn.Identity(), ["x"], ["features", "logits"]), "logits")
@@ -78,7 +78,7 @@ def output_key(module: TensorDictModuleBase, *expected: str) -> NestedKey:
         raise UserError(f"the module writes {names}: one of them must be named {named}")
     if (written := names[0]) in (ACTION_SCORE, GOAL_SCORE, SUITABILITY):
         raise UserError(
-            f"the module writes {written!r}: what is needed here is a judge that says {named}"
+            f"the module writes {written!r}: what is needed here is a network that writes {named}"
         )
     return written
 
@@ -97,56 +97,51 @@ def beside(batch: TensorDictBase, module: object) -> TensorDictBase:
     return batch if device is None or device.type == "cpu" else batch.to(device)
 
 
-def charges(module: nn.Module) -> bool:
-    """Whether a part of a module charges for what it computes in train mode.
+def has_word_penalty(module: nn.Module) -> bool:
+    """Whether a part of a module leaves a ``word_penalty`` when it computes in train mode.
 
-    >>> charges(nn.Linear(1, 1))
+    >>> has_word_penalty(nn.Linear(1, 1))
     False
     """
-    return any(hasattr(part, "charge") for part in module.modules())
+    return any(hasattr(part, "word_penalty") for part in module.modules())
 
 
-def take_charge(module: nn.Module) -> Tensor | None:
-    """Take what the parts of a module charge for their last batch, None where none does.
-
-    A part charges by leaving a ``charge``, a tensor of one number, when it computes in train mode.
+def take_word_penalty(module: nn.Module) -> Tensor | None:
+    """Take the ``word_penalty``, a tensor of one number, that a module's last batch left.
 
     >>> part = nn.Linear(1, 1)
-    >>> part.charge = torch.tensor(2.0)
-    >>> take_charge(nn.Sequential(part)), take_charge(part)
+    >>> part.word_penalty = torch.tensor(2.0)
+    >>> take_word_penalty(nn.Sequential(part)), take_word_penalty(part)
     (tensor(2.), None)
     """
     total: Tensor | None = None
     for part in module.modules():
-        charge = getattr(part, "charge", None)
-        if isinstance(charge, Tensor):
-            total = charge if total is None else total + charge
-            part.charge = None  # type: ignore[assignment]
+        penalty = getattr(part, "word_penalty", None)
+        if isinstance(penalty, Tensor):
+            total = penalty if total is None else total + penalty
+            part.word_penalty = None  # type: ignore[assignment]
     return total
 
 
-def set_lenient(module: nn.Module, lenient: bool) -> None:
-    """Tell the parts of a module that have a ``lenient`` whether they may be so for now.
+def set_word_swapping(module: nn.Module, on: bool) -> None:
+    """Switch on or off that the parts of a module with ``swaps_words`` do so in train mode.
 
     >>> part = nn.Linear(1, 1)
-    >>> part.lenient = False
-    >>> set_lenient(nn.Sequential(part), True)
-    >>> part.lenient
-    True
+    >>> part.swaps_words = True
+    >>> set_word_swapping(nn.Sequential(part), False)
+    >>> part.swaps_words
+    False
     """
     for part in module.modules():
-        if hasattr(part, "lenient"):
-            part.lenient = lenient  # type: ignore[assignment]
+        if hasattr(part, "swaps_words"):
+            part.swaps_words = on  # type: ignore[assignment]
 
 
 def hidden_from_python(tensor: Tensor) -> bool:
-    """Whether ``torch.vmap``, the compiler or a CUDA graph being captured works on ``tensor``.
+    """Whether the compiler or a CUDA graph being captured works on ``tensor``.
 
     No shape may then depend on its values.
     """
-    return is_traced(tensor) or (tensor.is_cuda and torch.cuda.is_current_stream_capturing())
-
-
-def is_traced(tensor: Tensor) -> bool:
-    """Whether ``torch.vmap`` or the compiler works on ``tensor``."""
-    return torch._C._functorch.is_batchedtensor(tensor) or torch.compiler.is_compiling()
+    if torch.compiler.is_compiling():
+        return True
+    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()

@@ -28,7 +28,7 @@ from ifo_grounding.data import (
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.evaluation import success_rate
 from ifo_grounding.networks import (
-    make_goal_judge,
+    make_goal_classifier,
     make_instruction_classifier,
     make_inverse,
     make_policy,
@@ -125,7 +125,7 @@ def loss_of(name, preset):
         return RewardLoss(make_reward_model(demos, preset, **build)), labelled_buffer(
             demos, labels()
         )
-    return GoalLoss(make_goal_judge(demos, preset, **build), demos.pool()), goal_buffer(demos)
+    return GoalLoss(make_goal_classifier(demos, preset, **build), demos.pool()), goal_buffer(demos)
 
 
 def losses(name, preset):
@@ -145,7 +145,7 @@ def phases(preset):
     if preset == "paper":
         reward = LearnedReward(make_reward_model(demos, preset, seed=0, dropout=0.0))
     else:
-        reward = GoalReward(make_goal_judge(demos, preset, seed=0), stop_action=5)
+        reward = GoalReward(make_goal_classifier(demos, preset, seed=0), stop_action=5)
     config = SelfExaminationConfig(
         algorithm="reinforce" if preset == "paper" else "ppo",
         iterations=3,

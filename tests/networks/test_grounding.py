@@ -5,14 +5,13 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 
-from ifo_grounding import distinct
 from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import episode_endings
-from ifo_grounding.modules import take_charge
+from ifo_grounding.modules import take_word_penalty
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy, make_value
-from ifo_grounding.networks.grounding import BEARINGS, MANNER, swap_words
-from ifo_grounding.networks.transfer import trunk_of
+from ifo_grounding.networks.grounding import BEARINGS, MODIFIER, swap_words
+from ifo_grounding.networks.warm_start import trunk_of
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
 from ifo_grounding.training import FitConfig, fit
@@ -30,8 +29,8 @@ def tiles(*objects, arm=35):
 
 def seen(image):
     torch.manual_seed(0)
-    looks = ColourAndForm(3, 64, 8)(image)
-    return looks.colour[looks.where[0]], looks.form[looks.where[0]]
+    cells = ColourAndForm(3, 64, 8)(image)
+    return cells.colour[cells.where[0]], cells.form[cells.where[0]]
 
 
 def test_colour_and_form_are_seen_apart():
@@ -50,9 +49,9 @@ def test_each_word_adds_evidence_of_its_own(shapes):
     words = trunk.words
     with torch.no_grad():
         words.relevance.weight.zero_()  # every word counts alike for every map
-        looks = trunk.looks(tiles("red circle", "blue triangle"))
+        cells = trunk.appearance(tiles("red circle", "blue triangle"))
         both, red, circle = (
-            words(looks, VOCABULARY.encode([text]))[0] for text in ("red circle", "red", "circle")
+            words(cells, VOCABULARY.encode([text]))[0] for text in ("red circle", "red", "circle")
         )
     torch.testing.assert_close(both, red + circle)
 
@@ -69,7 +68,7 @@ def test_roles_do_not_hear_every_word_in_training(shapes):
         [not torch.equal(*parts) for parts in zip(heard, words.roles(tokens), strict=True)]
         for _ in range(10)
     ]
-    assert all(map(any, zip(*differing, strict=True)))  # relevance and manner
+    assert all(map(any, zip(*differing, strict=True)))  # relevance and modifier
 
 
 def test_words_are_swapped_between_instructions_of_a_length():
@@ -87,7 +86,7 @@ def test_words_are_swapped_between_instructions_of_a_length():
     assert swap_words(tokens[:0], 1.0).shape == (0, 4)
 
 
-def test_what_words_say_is_charged_for_in_training(shapes):
+def test_what_words_say_is_penalised_in_training(shapes):
     policy = make_policy(shapes, "strong", seed=0)
     batch = TensorDict(
         {
@@ -97,17 +96,16 @@ def test_what_words_say_is_charged_for_in_training(shapes):
         },
         [1],
     )
-    loss = ImitationLoss(policy, charge=1.0)
-    charged = loss(batch)["loss_words"]
-    charged.backward()
+    loss = ImitationLoss(policy, word_penalty=1.0)
+    loss(batch)["loss_words"].backward()
     words = trunk_of(policy).words
     said = words.about_form.weight.grad.abs().sum(1) > 0
     assert said.nonzero().squeeze(1).tolist() == sorted(
         batch["instruction"][batch["instruction"] > 0].tolist()
     )
-    assert take_charge(policy) is None  # taken, so that the policy can be copied
-    assert "loss_words" not in loss.eval()(batch)
-    assert "loss_words" not in ImitationLoss(make_policy(shapes, "film", seed=0))(batch)
+    assert take_word_penalty(policy) is None  # taken, so that the policy can be copied
+    assert loss.eval()(batch)["loss_words"] == 0
+    assert "loss_words" not in ImitationLoss(make_policy(shapes, "paper", seed=0))(batch)
 
 
 def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
@@ -122,7 +120,7 @@ def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
         },
         [2],
     )
-    loss = ImitationLoss(policy, strict_from=0.5)
+    loss = ImitationLoss(policy, words_from=0.5)
     assert loss(batch)["loss_words"] == 0
     torch.manual_seed(0)
     as_said = words.eval().roles(batch["instruction"])[0]
@@ -133,10 +131,10 @@ def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
     assert not words.roles(batch["instruction"])[0].equal(as_said)
     loss.set_progress(0.0)  # as when training begins once more
     assert loss(batch)["loss_words"] == 0
-    ImitationLoss(policy)  # which is strict from the beginning, whatever came before
-    assert not words.lenient
+    ImitationLoss(policy)  # swaps from the start, whatever came before
+    assert words.swaps_words
     with pytest.raises(UserError, match=r"share of training in \[0, 1\], got 2"):
-        ImitationLoss(policy, strict_from=2)
+        ImitationLoss(policy, words_from=2)
 
 
 def test_words_outside_the_vocabulary_are_named(shapes):
@@ -171,7 +169,7 @@ def what_is_seen(trunk, image, words="red circle"):
         both = trunk(image, VOCABULARY.encode([words]))[0]
     maps, heads = 2 * trunk.words.relevance.out_channels, trunk.attention.out_features
     turned = BEARINGS * 2 * (heads + maps) if trunk.bearing is not None else 0
-    each = (len(both) - turned - 2 * maps - MANNER) // heads
+    each = (len(both) - turned - 2 * maps - MODIFIER) // heads
     return both[2 : each - maps]
 
 
@@ -187,7 +185,7 @@ def test_what_lies_around_is_seen(shapes, context):
     critic = make_value(shapes, "strong", init_from=policy, context=context)
     theirs = critic.module.trunk.state_dict()
     assert all(torch.equal(theirs[name], weight) for name, weight in trunk.state_dict().items())
-    with pytest.raises(UserError, match="the trunk of init_from does not fit"):
+    with pytest.raises(UserError, match="init_from does not fit"):
         make_value(shapes, "strong", init_from=policy, context=context + 1)
 
 
@@ -201,8 +199,8 @@ def test_bearings_turn_all_places(shapes):
         image = tiles("red circle", "blue triangle")
         known = trunk(image, VOCABULARY.encode(["red circle"]))[0]
     known, turned = known[: -BEARINGS * count], known[-BEARINGS * count :].view(BEARINGS, count)
-    pointed = known[-MANNER - 2 * maps : -MANNER]
-    own = known[: -MANNER - 2 * maps].view(heads, -1)[:, :2].flatten()
+    pointed = known[-MODIFIER - 2 * maps : -MODIFIER]
+    own = known[: -MODIFIER - 2 * maps].view(heads, -1)[:, :2].flatten()
     places = torch.cat([own, pointed])
     assert places.abs().max() > 0.1
     torch.testing.assert_close(turned, torch.stack([places, -places, 0 * places, places]))
@@ -220,29 +218,6 @@ def test_padding_says_nothing(shapes):
     both = logits(tokens)
     torch.testing.assert_close(logits(tokens[:1]), both[:1])
     torch.testing.assert_close(logits(F.pad(tokens, (0, 9))), both)
-
-
-def test_several_policies_run_side_by_side(shapes):
-    policies = [make_policy(shapes, "strong", seed=seed) for seed in (0, 1)]
-    batch = TensorDict(
-        {
-            "pixels": tiles("red circle", "blue triangle"),
-            "instruction": VOCABULARY.encode(["move to the red circle"]),
-        },
-        [1],
-    )
-    for policy in policies:
-        trunk_of(policy).words.usual.uniform_()
-    expected = torch.stack([policy(batch.copy())["logits"] for policy in policies])
-    distinct._factors.cache_clear()
-    parameters, buffers = torch.func.stack_module_state(policies)
-
-    def run(*weights):
-        return torch.func.functional_call(policies[0], weights, (batch.copy(),))["logits"]
-
-    found = torch.vmap(run, randomness="different")(parameters, buffers)
-    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
-    assert policies[0](batch.copy())["logits"].shape == (1, 6)  # nothing was left behind
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])

@@ -101,7 +101,7 @@ def test_keys_can_be_nested(kind, shapes):
     if kind == "policy":
         keys = {"action_key": ("agent", "choice"), "logits_key": ("agent", "scores")}
     else:
-        keys = {"out_key": ("agent", "judged")}
+        keys = {"out_key": ("agent", "said")}
     nested = MAKERS[kind](shapes, in_keys=nested_in, seed=0, **keys)
     data = inputs(shapes, [3])
     moved = TensorDict({"agent": data.clone()}, [3])
@@ -118,8 +118,8 @@ def test_wrong_images_batches_and_options_are_named(kind, shapes):
     small = inputs(Shapes((3, 40, 48), 40), [2])
     with pytest.raises(UserError, match=r"built for images of \(3, 48, 48\), got \(3, 40, 48\)"):
         run(kind, module, small)
-    with pytest.raises(UserError, match="unknown preset 'weak': choose one of 'paper', 'film'"):
-        MAKERS[kind](shapes, "weak")
+    with pytest.raises(UserError, match="unknown preset 'film': choose one of 'paper', 'strong'"):
+        MAKERS[kind](shapes, "film")
     with pytest.raises(UserError, match="unknown option of a network 'depth'"):
         MAKERS[kind](shapes, depth=3)
     with pytest.raises(UserError, match="in_keys must be"):
@@ -144,15 +144,13 @@ def test_impossible_configurations_are_refused(name, value):
 @pytest.mark.parametrize(
     ("preset", "options", "said"),
     [
-        ("film", {"kernel": 2}, "kernel must be odd.*got 2"),
-        ("film", {"kernel": 0}, "kernel must be at least 1, got 0"),
         ("paper", {"conv_layers": 0}, "conv_layers must be at least 1, got 0"),
-        ("paper", {"matching": "words", "maps": 8}, "needs preset 'strong' or 'film'"),
-        ("film", {"matching": "words"}, "maps must be at least 1, got 0"),
-        ("strong", {"hidden": 1}, "hidden must be at least 2, got 1"),
         ("strong", {"context": -1}, "context must be at least 0, got -1"),
-        ("film", {"n_blocks": -1}, "n_blocks must be at least 0, got -1"),
+        ("strong", {"maps": 0}, "maps must be at least 1, got 0"),
         ("strong", {"head_hidden": (8, 0)}, r"head_hidden must be at least 1, got \(8, 0\)"),
+        ("strong", {"sentence_rate": 0.5}, "an option of preset 'paper' alone.*leave it out"),
+        ("paper", {"heads": 4}, "an option of preset 'strong' alone.*leave it out"),
+        ("paper", {"sentence_pooling": "max"}, "unknown sentence_pooling 'max'"),
     ],
 )
 def test_sizes_that_make_no_network_are_refused(preset, options, said):
@@ -164,10 +162,7 @@ def test_presets_are_what_the_design_says():
     paper = NetworkConfig.of("policy", "paper")
     assert (paper.conv_layers, paper.features, paper.hidden, paper.embedding) == (4, 32, 64, 8)
     assert paper.dropout == 0.25
-    film = NetworkConfig.of("policy", "film")
-    assert (film.n_blocks, film.features, film.heads, film.matching) == (2, 64, 8, "sentence")
-    strong = NetworkConfig.of("policy")
-    assert (strong.preset, strong.matching, strong.maps) == ("strong", "words", 8)
+    assert NetworkConfig.of("policy").preset == "strong"
 
 
 def test_bf16_stays_near_fp32(kind, preset, shapes):

@@ -86,8 +86,10 @@ def test_foreign_files_are_refused(tmp_path):
     torch.save({"a": torch.zeros(1)}, path)
     with pytest.raises(UserError, match="damaged or no safetensors"):
         load(path)
-    save_file({"a": torch.zeros(1)}, path)
-    with pytest.raises(UserError, match="no network of ifo-grounding"):
+    save_file({"a": torch.zeros(1)}, path, {"format": "ifo-grounding network 1"})
+    with pytest.raises(
+        UserError, match=r"no network of this version .*network 1'.* train it again"
+    ):
         load(path)
 
 
@@ -110,6 +112,7 @@ def rewrite(path, change):
 CHANGES = {
     "another kind": lambda content, weights: content.update(kind="oracle"),
     "another size": lambda content, weights: content["config"].update(features=32),
+    "a preset that is gone": lambda content, weights: content["config"].update(preset="film"),
     "an unknown option": lambda content, weights: content["config"].update(depth=2),
     "a missing weight": lambda content, weights: weights.popitem(),
     "a missing part": lambda content, weights: content.pop("shapes"),

@@ -4,7 +4,7 @@ from tensordict import TensorDict
 
 from ifo_grounding.networks import (
     Shapes,
-    make_goal_judge,
+    make_goal_classifier,
     make_instruction_classifier,
     make_inverse,
     make_policy,
@@ -25,11 +25,11 @@ LOSSES = {
     "imitation": (make_policy, ImitationLoss, {}),
     "instruction": (make_instruction_classifier, InstructionLoss, {"pool": POOL}),
     "reward": (make_reward_model, RewardLoss, {}),
-    "goal": (make_goal_judge, GoalLoss, {"pool": POOL}),
+    "goal": (make_goal_classifier, GoalLoss, {"pool": POOL}),
 }
 
 
-@pytest.fixture(params=["film", "strong", "paper"])
+@pytest.fixture(params=["strong", "paper"])
 def preset(request):
     return request.param
 
@@ -39,9 +39,9 @@ def kind(request):
     return request.param
 
 
-def make_loss(kind: str, preset: str = "film", make_options=None, **options):
+def make_loss(kind: str, preset: str = "paper", make_options=None, **options):
     make, loss, defaults = LOSSES[kind]
-    network = make(SHAPES, preset, seed=0, **(make_options or {}))
+    network = make(SHAPES, preset, **{"seed": 0, "dropout": 0.0, **(make_options or {})})
     return loss(network, **{**defaults, **options})
 
 

@@ -41,7 +41,7 @@ def test_scores_travel_with_the_state():
 
 
 def test_the_estimated_share_is_removed_after_the_warm_up():
-    negatives = NegativeInstructions(POOL, "estimated", warmup=0.5)
+    negatives = NegativeInstructions(POOL, None, warmup=0.5)
     scores = torch.tensor([3.0, -1.0, -2.0, -3.0])
     negatives.watch(torch.full((4,), 3.0), scores)
     negatives.progress = 0.4
@@ -58,7 +58,7 @@ def scored(share: float) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_removal_does_not_feed_itself():
-    negatives = NegativeInstructions(POOL, "estimated", warmup=0.5)
+    negatives = NegativeInstructions(POOL, None, warmup=0.5)
     negatives.progress = 0.4
     negatives.watch(*scored(1 / 4))
     negatives.progress = 0.6
@@ -75,7 +75,7 @@ def test_removal_does_not_feed_itself():
 
 
 def test_scores_of_both_kinds_reach_back_as_far():
-    negatives = NegativeInstructions(POOL, "estimated")
+    negatives = NegativeInstructions(POOL, None)
     rows = torch.arange(4096, dtype=torch.float32)
     for batch in rows.split(128):
         negatives.watch(batch, batch.unsqueeze(1).expand(-1, 32))
@@ -84,7 +84,7 @@ def test_scores_of_both_kinds_reach_back_as_far():
 
 
 def test_where_few_are_suitable_after_the_warm_up_none_are_removed_for_good():
-    negatives = NegativeInstructions(POOL, "estimated", warmup=0.5)
+    negatives = NegativeInstructions(POOL, None, warmup=0.5)
     negatives.progress = 0.6
     negatives.watch(*scored(1 / 32))
     assert negatives.keep(torch.rand(1024)).all()
@@ -94,7 +94,7 @@ def test_where_few_are_suitable_after_the_warm_up_none_are_removed_for_good():
 
 
 def test_the_bound_of_removal_travels_with_the_state_and_no_look_moves_it():
-    negatives, other = (NegativeInstructions(POOL, "estimated", warmup=0.5) for _ in range(2))
+    negatives, other = (NegativeInstructions(POOL, None, warmup=0.5) for _ in range(2))
     negatives.watch(*scored(1 / 8))
     assert negatives.eval().keep(torch.rand(1024)).sum() == 896
     assert float(negatives.bound) == 1
@@ -105,12 +105,12 @@ def test_the_bound_of_removal_travels_with_the_state_and_no_look_moves_it():
 
 
 def test_a_share_that_is_given_cannot_be_asked_for():
-    with pytest.raises(UserError, match="removal_rate='estimated'"):
+    with pytest.raises(UserError, match="removal_rate=None"):
         NegativeInstructions(POOL, 0.3).suitable_share()
 
 
 def test_an_untrained_classifier_does_not_remove_nearly_all():
-    negatives = NegativeInstructions(POOL, "estimated")
+    negatives = NegativeInstructions(POOL, None)
     negatives.watch(torch.zeros(100), torch.zeros(100))
     assert negatives.removal_rate == MOST_REMOVED
 

@@ -9,7 +9,7 @@ from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDic
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import Shapes, make_instruction_classifier, make_policy
-from ifo_grounding.networks.transfer import inherited
+from ifo_grounding.networks.warm_start import inherited
 from ifo_grounding.objectives import ImitationLoss, InstructionLoss
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.training.updates import total_loss

@@ -14,7 +14,7 @@ from torchrl.objectives.value import GAE
 
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.networks import (
-    make_goal_judge,
+    make_goal_classifier,
     make_instruction_classifier,
     make_policy,
     make_reward_model,
@@ -171,7 +171,7 @@ def networks():
     last = [part for part in suitability.modules() if isinstance(part, nn.Linear)][-1]
     with torch.no_grad():
         last.bias.fill_(4.0)
-    return suitability, make_reward_model(source, seed=0), make_goal_judge(source, seed=0)
+    return suitability, make_reward_model(source, seed=0), make_goal_classifier(source, seed=0)
 
 
 @pytest.fixture

@@ -1,12 +1,12 @@
-"""How every ``make_*`` function builds: sizes, configuration, seed, device, and a record of it."""
+"""The one builder behind the ``make_*`` functions: sizes, configuration, seed, and a record."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -29,21 +29,19 @@ class Blueprint:
     """What it was built for."""
     config: NetworkConfig
     """Its sizes and choices."""
-    options: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any]
     """Keyword arguments of its ``make_*`` function: keys and the like."""
 
-
-def blueprint(
-    kind: str, source: Any, preset: str, options: dict[str, Any], overrides: dict[str, Any]
-) -> Blueprint:
-    """Settle the sizes and choices of a network, from the entries that it is to read."""
-    image, words = (1, 2) if kind == "goal" else (0, 1)
-    shown = getattr(source, "observation_spec", None)
-    leaves = set() if shown is None else set(shown.keys(True, True))
-    asked = {"pixels": options["in_keys"][image], "instruction": options["in_keys"][words]}
-    shapes = Shapes.of(source, **{name: key for name, key in asked.items() if key in leaves})
-    config = NetworkConfig.of(kind, preset, **overrides)
-    return Blueprint(kind, shapes, replace(config, patch_size=patch_size(shapes, config)), options)
+    @classmethod
+    def of(cls, module: nn.Module) -> Blueprint:
+        """Return what a network was built by, or refuse what no ``make_*`` function built."""
+        plan = getattr(module, "network_config", None)
+        if not isinstance(plan, Blueprint):
+            raise UserError(
+                f"cannot save {type(module).__name__}: only what a make_* function of "
+                "ifo_grounding.networks built can be saved"
+            )
+        return plan
 
 
 class Shareable(nn.Module):
@@ -63,42 +61,62 @@ class Shareable(nn.Module):
             self.save_pretrained(folder, hub_id=hub_id, **options)
 
 
-class Network(Shareable, TensorDictModule):
+class NetworkModule(Shareable, TensorDictModule):
     """A network with names for what it reads and writes."""
 
 
-Built = TypeVar("Built", bound=nn.Module)
-
-
-def construct(
-    network: Callable[..., Built],
-    plan: Blueprint,
+def build(
+    kind: str,
+    network: Callable[[Shapes, NetworkConfig], nn.Module],
+    source: Any,
+    preset: str,
+    inputs: Sequence[str],
+    options: dict[str, Any],
+    *,
     device: torch.device | str | None,
     seed: int | None,
-) -> Built:
-    """Build ``network``, seeded without touching the caller's generators, in eval mode.
+    overrides: dict[str, Any],
+    wrap: Callable[[nn.Module, Blueprint], Any] | None = None,
+) -> Any:
+    """Build a network in eval mode, seeded without touching the caller's generators.
 
     Weights are laid out channels last, which more than doubles the speed of convolutions on a CPU.
+
+    Args:
+        kind: which network.
+        network: its class, or a function that builds it.
+        source: what sizes are read from, see :meth:`Shapes.of`.
+        preset: ``"strong"`` or ``"paper"``.
+        inputs: what each of ``in_keys`` is, for the error.
+        options: the keyword arguments of the ``make_*`` function that are not named here.
+        device: where to build it.
+        seed: makes the initial weights a function of the seed alone.
+        overrides: values of :class:`NetworkConfig` to replace.
+        wrap: makes what is returned of the network; by default a TensorDictModule.
     """
+    in_keys: Sequence[NestedKey] = options["in_keys"]
+    if isinstance(in_keys, str) or len(in_keys) != len(inputs):
+        raise UserError(
+            f"in_keys must be {len(inputs)} keys ({', '.join(inputs)}), got {in_keys!r}"
+        )
+    options = {**options, "in_keys": list(in_keys)}
+    shown = getattr(source, "observation_spec", None)
+    leaves = set() if shown is None else set(shown.keys(True, True))
+    read = dict(zip(inputs, in_keys, strict=True))
+    asked = {"pixels": read["image"], "instruction": read.get("instruction")}
+    shapes = Shapes.of(source, **{name: key for name, key in asked.items() if key in leaves})
+    config = NetworkConfig.of(kind, preset, **overrides)
+    if preset == "strong":
+        config = replace(config, patch_size=patch_size(shapes, config))
+    plan = Blueprint(kind, shapes, config, options)
     with torch.random.fork_rng(devices=[], enabled=seed is not None):
         if seed is not None:
-            name = seeding.derive(seed, "networks", plan.kind)
-            torch.default_generator.manual_seed(name)
-        module = network(plan.shapes, plan.config)
-    module = module.eval().to(torch.device(device or "cpu"))
-    return module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-
-def wrap(
-    network: nn.Module, plan: Blueprint, in_keys: Sequence[NestedKey], out_keys: list[NestedKey]
-) -> TensorDictModule:
-    """Make a TensorDictModule of ``network`` that carries its blueprint."""
-    module = Network(network, in_keys=list(in_keys), out_keys=out_keys)
+            torch.default_generator.manual_seed(seeding.derive(seed, "networks", kind))
+        built = network(shapes, config).eval().to(torch.device(device or "cpu"))
+    built = built.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if wrap is None:
+        module = NetworkModule(built, in_keys=options["in_keys"], out_keys=[options["out_key"]])
+    else:
+        module = wrap(built, plan)
     module.network_config = plan
     return module.eval()
-
-
-def check_keys(in_keys: Sequence[NestedKey], names: Sequence[str]) -> None:
-    """Raise :class:`UserError` unless there is one key for each input."""
-    if isinstance(in_keys, str) or len(in_keys) != len(names):
-        raise UserError(f"in_keys must be {len(names)} keys ({', '.join(names)}), got {in_keys!r}")

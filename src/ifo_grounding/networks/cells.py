@@ -1,10 +1,9 @@
 """Cells that look alike are computed once.
 
-Where no cell of a feature map sees another, what is computed for a cell depends on its picture and
-on the instruction alone. Worlds made of tiles show the same few pictures again and again: a batch
-of 512 images of 36 cells holds some 300 different ones, and 4,000 different pairs of a picture and
-an instruction instead of 18,000. So each is computed once and looked up wherever it is needed. The
-result is the same up to rounding; images without repetition take the plain way.
+Where no cell of a feature map sees another, what is computed for a cell depends on its picture
+alone. Worlds made of tiles show the same few pictures again and again: a batch of 512 images of 36
+cells holds some 300 different ones. So each is computed once and looked up wherever it is needed.
+The result is the same up to rounding.
 """
 
 from __future__ import annotations
@@ -17,94 +16,6 @@ from torch import Tensor
 
 ROOM = 1 << 22
 """Entries of the largest table in which pairs are marked; more pairs than that are sorted."""
-
-
-@dataclass
-class Cells:
-    """The cells of a batch of feature maps, each distinct one stored once."""
-
-    features: Tensor
-    """[U, F]"""
-    index: Tensor
-    """Which of them lies in each cell, int64 [N, h * w]."""
-
-    def __len__(self) -> int:
-        """Return the number of feature maps."""
-        return len(self.index)
-
-    def maps(self, height: int, width: int) -> Tensor:
-        """Return the feature maps, [N, F, height, width], channels last in memory."""
-        return look_up(self.features, self.index).unflatten(1, (height, width)).movedim(-1, 1)
-
-    def __getitem__(self, rows: Tensor | slice) -> Cells:
-        """Return the feature maps of some rows."""
-        return Cells(self.features, self.index[rows])
-
-
-@dataclass
-class Pairs:
-    """The distinct pairs of a cell and an instruction in a batch."""
-
-    cell: Tensor
-    """Which cell, int64 [P]."""
-    instruction: Tensor
-    """Which instruction, int64 [P]."""
-    index: Tensor
-    """Which pair lies in each cell of each row, int64 [R, h * w]."""
-
-    def __len__(self) -> int:
-        """Return the number of distinct pairs."""
-        return len(self.cell)
-
-    def __getitem__(self, some: slice) -> Pairs:
-        """Return some of the pairs; where they lie stays numbered as it was."""
-        return Pairs(self.cell[some], self.instruction[some], self.index)
-
-
-@dataclass
-class Groups:
-    """The cells of each feature map, those that look alike counted instead of repeated."""
-
-    cell: Tensor
-    """Which distinct cell, int64 [N, J]."""
-    number: Tensor
-    """How many places show it, [N, J]; 0 where a map has fewer than J kinds of cells."""
-    mean: Tensor
-    """The mean of what else is known of these places, [N, J, D]."""
-
-    def __getitem__(self, rows: Tensor | slice) -> Groups:
-        """Return the groups of some feature maps."""
-        return Groups(self.cell[rows], self.number[rows], self.mean[rows])
-
-    def repeated(self, times: int) -> Groups:
-        """Return each feature map's groups several times in a row."""
-        parts = (self.cell, self.number, self.mean)
-        return Groups(*(part.repeat_interleave(times, 0) for part in parts))
-
-
-def group_cells(index: Tensor, known: Tensor) -> Groups:
-    """Group the cells of feature maps that look alike.
-
-    Args:
-        index: which distinct cell lies in each cell, int64 [N, C].
-        known: what else is known of each cell, such as its place, [C, D] or [N, C, D].
-
-    >>> groups = group_cells(torch.tensor([[4, 7, 4], [5, 5, 5]]), torch.eye(3)[:, :2])
-    >>> groups.cell.tolist(), groups.number.tolist()
-    ([[4, 7], [5, 5]], [[2.0, 1.0], [3.0, 0.0]])
-    >>> groups.mean[0].tolist()
-    [[0.5, 0.0], [0.0, 1.0]]
-    """
-    cells, order = index.sort(1)
-    begins = F.pad(cells[:, 1:] != cells[:, :-1], (1, 0), value=True)
-    group = begins.cumsum(1) - 1
-    kinds = int(group.max()) + 1 if group.numel() else 1
-    cell = cells[:, :1].repeat(1, kinds).scatter_(1, group, cells)
-    of = torch.empty_like(group).scatter_(1, order, group)  # the group of each cell
-    member = F.one_hot(of, kinds).to(known.dtype)
-    number = member.sum(1)
-    mean = member.transpose(1, 2) @ known / number.clamp_min(1).unsqueeze(-1)
-    return Groups(cell, number, mean)
 
 
 @dataclass
@@ -127,20 +38,42 @@ class Kinds:
         return Kinds(self.features[rows], self.place[rows], self.number[rows])
 
 
-def pair_up(cells: Tensor, instructions: Tensor, n_cells: int, n_instructions: int) -> Pairs:
-    """Find the distinct pairs of a cell and an instruction.
+def group_cells(index: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Group the cells of feature maps that look alike.
 
     Args:
-        cells: numbers of the cells of each row, int64 [R, h * w].
-        instructions: number of the instruction of each row, int64 [R].
-        n_cells: how many cells are numbered.
-        n_instructions: how many instructions are numbered.
+        index: which distinct cell lies in each cell, int64 [N, C].
+        known: what else is known of each cell, such as its place, [N, C, D].
 
-    >>> pairs = pair_up(torch.tensor([[0, 1, 0], [1, 1, 0]]), torch.tensor([2, 2]), 2, 3)
-    >>> pairs.cell.tolist(), pairs.instruction.tolist(), pairs.index.tolist()
-    ([0, 1], [2, 2], [[0, 1, 0], [1, 1, 0]])
+    Returns:
+        Of each map's groups: which distinct cell, int64 [N, J]; how many places show it, [N, J], 0
+        where a map has fewer than J kinds of cells; and the mean of what is known of these places,
+        [N, J, D].
+
+    >>> cell, number, mean = group_cells(torch.tensor([[4, 7, 4]]), torch.eye(3)[None, :, :2])
+    >>> cell.tolist(), number.tolist(), mean.tolist()
+    ([[4, 7]], [[2.0, 1.0]], [[[0.5, 0.0], [0.0, 1.0]]])
     """
-    return Pairs(*distinct_pairs(cells, instructions.unsqueeze(1), n_cells, n_instructions))
+    cells, order = index.sort(1)
+    begins = F.pad(cells[:, 1:] != cells[:, :-1], (1, 0), value=True)
+    group = begins.cumsum(1) - 1
+    kinds = int(group.max()) + 1 if group.numel() else 1
+    cell = cells[:, :1].repeat(1, kinds).scatter_(1, group, cells)
+    of = torch.empty_like(group).scatter_(1, order, group)  # the group of each cell
+    member = F.one_hot(of, kinds).to(known.dtype)
+    number = member.sum(1)
+    mean = member.transpose(1, 2) @ known / number.clamp_min(1).unsqueeze(-1)
+    return cell, number, mean
+
+
+def cell_places(grid: tuple[int, int]) -> Tensor:
+    """Return the row and column of each cell in [-1, 1], [h * w, 2]; 0 along a side of one cell.
+
+    >>> cell_places((1, 2)).tolist()
+    [[0.0, -1.0], [0.0, 1.0]]
+    """
+    axes = [torch.linspace(-1, 1, length) if length > 1 else torch.zeros(1) for length in grid]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
 
 
 def distinct_pairs(

@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.networks.cells import Cells, look_up
+from ifo_grounding.networks.cells import look_up
+from ifo_grounding.networks.layers import init_before_relu
 from ifo_grounding.networks.patches import (
     Windows,
     as_float,
@@ -22,9 +23,9 @@ from ifo_grounding.networks.patches import (
 class ConvEncoder(nn.Module):
     """Convolutions of kernel 3, stride 2, padding 1 with ReLU (the paper's experimental settings).
 
-    Weights begin as :func:`begin_before_relu` draws them: PyTorch's own, which are smaller, would
-    leave a fiftieth of an image's contrast after four layers. Where what a layer looks at repeats,
-    over a batch of images, the layer sees it once.
+    Initial weights are He's: PyTorch's own, which are smaller, would leave a fiftieth of an image's
+    contrast after four layers. Where what a layer looks at repeats, over a batch of images, the
+    layer sees it once.
 
     >>> ConvEncoder(3, features=32, layers=4)(torch.zeros(2, 3, 48, 48)).shape
     torch.Size([2, 32, 3, 3])
@@ -41,7 +42,7 @@ class ConvEncoder(nn.Module):
             )
         )
         for layer in self.convolutions:
-            begin_before_relu(layer)
+            init_before_relu(layer)
 
     @property
     def convolutions(self) -> list[nn.Conv2d]:
@@ -69,13 +70,6 @@ class ConvEncoder(nn.Module):
         return height, width
 
 
-def begin_before_relu(layer: nn.Conv2d | nn.Linear) -> None:
-    """Draw the initial weights of a layer that a ReLU follows (He et al. 2015), and no bias."""
-    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-    assert layer.bias is not None
-    nn.init.zeros_(layer.bias)
-
-
 def _two_layers(first: nn.Conv2d, second: nn.Conv2d, windows: Windows) -> Tensor:
     """Map windows to what two convolutions of kernel 3 and stride 2 make of each, [U, F]."""
     seen = as_float(windows.pixels, first.weight).contiguous(memory_format=torch.channels_last)
@@ -98,40 +92,49 @@ class PatchEncoder(nn.Module):
     A linear layer of rearranged pixels, which trains faster on a CPU than a strided convolution:
     bytes are cheaper to rearrange than floats, and the layout fits the convolutions that follow.
     An image whose sides are not multiples of the patch is padded with black to the right and below.
+    Where patches of bytes repeat, each distinct one is embedded once.
+
+    Args:
+        channels: what :attr:`complete` makes of an image's channels.
+        features: F.
+        patch: pixels along one side of a patch.
+        complete: makes what is embedded of images or distinct patches, [N, C, ...]; by default they
+            are embedded as they are.
 
     >>> PatchEncoder(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48)).shape
     torch.Size([2, 64, 6, 6])
     """
 
-    def __init__(self, channels: int, features: int, patch: int) -> None:
+    def __init__(
+        self,
+        channels: int,
+        features: int,
+        patch: int,
+        complete: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
         super().__init__()
-        self.patch = patch
+        self.patch, self.complete = patch, complete or nn.Identity()
         self.embed = nn.Linear(channels * patch**2, features)
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w], channels last in memory."""
-        return self.embed(as_float(patches(image, self.patch), self.embed.weight)).permute(
-            0, 3, 1, 2
-        )
+        found = distinct_patches(image, self.patch)
+        if found is not None:
+            height, width = image.shape[-2:]
+            return self.look_up(*found, self.grid(height, width, self.patch))
+        cut = as_float(patches(self.complete(image), self.patch), self.embed.weight)
+        return self.embed(cut).permute(0, 3, 1, 2)
 
-    def cells(
-        self, image: Tensor, complete: Callable[[Tensor], Tensor] | None = None
-    ) -> Cells | None:
-        """Map an image [N, C, H, W] to its distinct cells; None where that would not pay.
-
-        It pays on a CPU, for images of bytes in which more than half of the patches repeat.
+    def look_up(self, distinct: Tensor, index: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Embed distinct patches [U, C, P * P] once, and look them up: [N, F, h, w].
 
         Args:
-            image: [N, C, H, W].
-            complete: makes what is embedded out of distinct patches, uint8 [U, C, patch * patch].
+            distinct: of bytes.
+            index: which of them lies where, int64 [N, h * w].
+            grid: h and w.
         """
-        found = distinct_patches(image, self.patch)
-        if found is None:
-            return None
-        distinct, index = found
-        if complete is not None:
-            distinct = complete(distinct)
-        return Cells(self.embed(as_float(distinct.flatten(1), self.embed.weight)), index)
+        pixels = as_float(self.complete(distinct).flatten(1), self.embed.weight)
+        return look_up(self.embed(pixels), index).unflatten(1, grid).movedim(-1, 1)
 
     @staticmethod
     def grid(height: int, width: int, patch: int) -> tuple[int, int]:

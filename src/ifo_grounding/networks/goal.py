@@ -12,11 +12,12 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from ifo_grounding import keys
-from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
-from ifo_grounding.networks.instruction import begin_with_policy, pair_scorer
+from ifo_grounding.networks.building import build
+from ifo_grounding.networks.instruction import pair_scorer
+from ifo_grounding.networks.warm_start import start_scorer
 
 
-def make_goal_judge(
+def make_goal_classifier(
     spec_source: Any,
     preset: str = "strong",
     *,
@@ -27,20 +28,20 @@ def make_goal_judge(
     seed: int | None = None,
     **overrides: Any,
 ) -> TensorDictModule:
-    """Build the goal judge: first image, image and instruction to a logit of success [*B, 1].
+    """Build the goal classifier: first image, image and instruction to a logit of success [*B, 1].
 
-    An extension of the paper, which assumes that demonstrations end in success. ``encode_pixels``
-    (of both images), ``encode_instruction``, ``score`` and ``score_all`` work as those of the
-    instruction module.
+    An extension of the paper, which assumes that demonstrations end in success. ``encode_scenes``
+    (of both images), ``encode_instruction`` and ``score_candidates`` work as those of the
+    instruction classifier.
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"film"`` or ``"paper"``.
+        preset: ``"strong"`` or ``"paper"``.
         in_keys: the episode's first image and the present one, uint8 [*B, C, H, W], and the
             instruction, int64 [*B, L].
         out_key: where the logit goes.
-        init_from: a policy of the same preset and sizes, whose weights it begins with: of the
-            first image it sees nothing then, until it learns to.
+        init_from: a policy of the same preset and sizes whose weights are copied (a warm start): it
+            then sees nothing of the first image, until it learns to.
         device: where to build it.
         seed: makes the initial weights a function of the seed alone.
         overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
@@ -50,15 +51,23 @@ def make_goal_judge(
             does not fit.
 
     >>> from ifo_grounding.networks import Shapes
-    >>> judge = make_goal_judge(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
+    >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    >>> classifier = make_goal_classifier(shapes, seed=0)
     >>> frame = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
-    >>> judge(initial_pixels=frame, pixels=frame, instruction=torch.ones(2, 16)).shape
+    >>> classifier(initial_pixels=frame, pixels=frame, instruction=torch.ones(2, 16)).shape
     torch.Size([2, 1])
     """
-    check_keys(in_keys, ("first image", "image", "instruction"))
-    options = {"in_keys": list(in_keys), "out_key": out_key}
-    plan = blueprint("goal", spec_source, preset, options, overrides)
-    network = construct(partial(pair_scorer, images=2), plan, device, seed)
+    classifier: TensorDictModule = build(
+        "goal",
+        partial(pair_scorer, images=2),
+        spec_source,
+        preset,
+        ("first image", "image", "instruction"),
+        {"in_keys": in_keys, "out_key": out_key},
+        device=device,
+        seed=seed,
+        overrides=overrides,
+    )
     if init_from is not None:
-        begin_with_policy(network, init_from, plan)
-    return wrap(network, plan, in_keys, [out_key])
+        start_scorer(classifier.module, init_from)
+    return classifier

@@ -13,38 +13,34 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from ifo_grounding import keys
-from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
-from ifo_grounding.networks.cells import Cells, distinct_pairs
+from ifo_grounding.networks.base import ImageNetwork, same_batch
+from ifo_grounding.networks.building import build
+from ifo_grounding.networks.cells import distinct_pairs
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import PatchEncoder
-from ifo_grounding.networks.fusion import ResidualBlock, pool_cells
-from ifo_grounding.networks.patches import as_float
-from ifo_grounding.networks.shapes import Shapes
-from ifo_grounding.networks.trunk import (
-    Network,
-    flatten_cells,
-    grid,
-    head,
-    image_encoder,
-    same_batch,
-)
+from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
+from ifo_grounding.networks.layers import ResidualBlock, flatten_cells, head, pool_cells
+from ifo_grounding.networks.shapes import Shapes, patch_size
 
 
-class InverseNetwork(Network):
+class InverseNetwork(ImageNetwork):
     """inv(s, s') -> logits of the actions.
 
-    ``paper`` sees the two images alone. Other presets also see how far each pixel changed, which
-    makes a stop plain, and pool over cells: what changes tells the action wherever it happens.
+    ``paper`` sees the two images alone. ``strong`` also sees how far each pixel changed, which
+    makes a stop plain, and pools over cells: what changes tells the action wherever it happens.
     """
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__(shapes, config)
-        self.paper = config.preset == "paper"
-        self.image = image_encoder(shapes, config, images=2 if self.paper else 3)
-        self.blocks = nn.Sequential(
-            *(ResidualBlock(config.features) for _ in range(config.context))
-        )
-        size = config.features * (math.prod(grid(shapes, config)) if self.paper else 2)
+        channels, features = shapes.image_shape[0], config.features
+        self.image: ConvEncoder | PatchEncoder
+        if config.preset == "paper":
+            self.image = ConvEncoder(2 * channels, features, config.conv_layers)
+            size = features * math.prod(self.grid)
+        else:
+            patch = patch_size(shapes, config)
+            self.image = PatchEncoder(3 * channels, features, patch, _with_change)
+            size = 2 * features
+        self.blocks = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
         self.head = head(size, config, shapes.n_actions)
 
     def forward(self, pixels: Tensor, next_pixels: Tensor) -> Tensor:
@@ -53,7 +49,7 @@ class InverseNetwork(Network):
         after, next_batch = self.flat_pixels(next_pixels)
         same_batch(pixels=batch, next_pixels=next_batch)
         with self.autocast(pixels):
-            outputs = self._judged(self._encoded(torch.cat([before, after], -3)))
+            outputs = self._logits(self.image(torch.cat([before, after], -3)))
         return outputs.float().reshape(*batch, outputs.shape[-1])
 
     def reads_tiles(self, image_shape: tuple[int, ...], tile_size: int | None) -> bool:
@@ -74,30 +70,19 @@ class InverseNetwork(Network):
             Logits, float32 [N, A].
         """
         assert isinstance(self.image, PatchEncoder)
-        height, width = before.shape[1:]
         codes = before.flatten(1).long(), after.flatten(1).long()
         first, second, index = distinct_pairs(*codes, len(tiles), len(tiles))
         seen = torch.cat([tiles[first], tiles[second]], 1).flatten(2)
+        height, width = before.shape[1:]
         with self.autocast(tiles):
-            pixels = as_float(_with_change(seen).flatten(1), self.image.embed.weight)
-            features = self.image.embed(pixels)
-            outputs = self._judged(Cells(features, index).maps(height, width))
+            outputs = self._logits(self.image.look_up(seen, index, (height, width)))
         return outputs.float()
 
-    def _judged(self, encoded: Tensor) -> Tensor:
+    def _logits(self, encoded: Tensor) -> Tensor:
         """Map encoded images [N, F, h, w] to logits [N, A]."""
         features = F.relu(self.blocks(F.relu(encoded)))
-        return self.head(flatten_cells(features) if self.paper else pool_cells(features))
-
-    def _encoded(self, both: Tensor) -> Tensor:
-        """Encode two images on top of each other, [N, 2 C, H, W], to [N, F, h, w]."""
-        if self.paper:
-            return self.image(both)
-        assert isinstance(self.image, PatchEncoder)
-        cells = self.image.cells(both, _with_change)
-        if cells is None:
-            return self.image(_with_change(both))
-        return cells.maps(*grid(self.shapes, self.config))
+        paper = self.config.preset == "paper"
+        return self.head(flatten_cells(features) if paper else pool_cells(features))
 
 
 def _with_change(both: Tensor) -> Tensor:
@@ -120,7 +105,7 @@ def make_inverse(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"film"`` or ``"paper"``.
+        preset: ``"strong"`` or ``"paper"``.
         in_keys: the image before and the image after, uint8 [*B, C, H, W].
         out_key: where the logits go.
         device: where to build it.
@@ -135,7 +120,14 @@ def make_inverse(
     >>> inverse(pixels=frame, next_pixels=frame).shape
     torch.Size([2, 6])
     """
-    check_keys(in_keys, ("image", "next image"))
-    options = {"in_keys": list(in_keys), "out_key": out_key}
-    plan = blueprint("inverse", spec_source, preset, options, overrides)
-    return wrap(construct(InverseNetwork, plan, device, seed), plan, in_keys, [out_key])
+    return build(
+        "inverse",
+        InverseNetwork,
+        spec_source,
+        preset,
+        ("image", "next image"),
+        {"in_keys": in_keys, "out_key": out_key},
+        device=device,
+        seed=seed,
+        overrides=overrides,
+    )

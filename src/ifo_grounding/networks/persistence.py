@@ -16,31 +16,29 @@ from torch import nn
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import atomic_write
 from ifo_grounding.networks.building import Blueprint
-from ifo_grounding.networks.goal import make_goal_judge
+from ifo_grounding.networks.goal import make_goal_classifier
 from ifo_grounding.networks.instruction import make_instruction_classifier
 from ifo_grounding.networks.inverse import make_inverse
 from ifo_grounding.networks.policy import make_policy, make_value
 from ifo_grounding.networks.reward import make_reward_model
 from ifo_grounding.networks.shapes import Shapes
 
-FORMAT = "ifo-grounding network 1"
-BEFORE: dict[str, Any] = {"sentence_rate": 1.0, "sentence_pooling": "last"}
-"""Options that files made before them lack, as those networks were."""
+FORMAT = "ifo-grounding network 2"
 MAKERS: dict[str, Callable[..., Any]] = {
     "inverse": make_inverse,
     "policy": make_policy,
     "value": make_value,
     "instruction": make_instruction_classifier,
     "reward": make_reward_model,
-    "goal": make_goal_judge,
+    "goal": make_goal_classifier,
 }
 
 
 def save(module: nn.Module, path: str | Path) -> None:
     """Write a network built by a ``make_*`` function to ``path``, atomically.
 
-    What it began with (``init_from``) is not kept: train on before it is saved where weights are to
-    decay to what they were there.
+    What was copied from ``init_from`` is not kept: training on after loading lets weights decay to
+    zero, not to what they were there.
 
     Raises:
         UserError: for a module that no ``make_*`` function built.
@@ -53,24 +51,13 @@ def save(module: nn.Module, path: str | Path) -> None:
     >>> all(map(torch.equal, policy.state_dict().values(), again.state_dict().values()))
     True
     """
-    plan = asdict(plan_of(module))
+    plan = asdict(Blueprint.of(module))
     metadata = {"format": FORMAT, "network": json.dumps(plan, sort_keys=True)}
     weights = {
         name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()
     }
     with atomic_write(path) as temporary:
         save_file(weights, temporary, metadata)
-
-
-def plan_of(module: nn.Module) -> Blueprint:
-    """Return the plan that a network was built by, or refuse what no ``make_*`` function built."""
-    plan = getattr(module, "network_config", None)
-    if not isinstance(plan, Blueprint):
-        raise UserError(
-            f"cannot save {type(module).__name__}: only what a make_* function of "
-            "ifo_grounding.networks built can be saved"
-        )
-    return plan
 
 
 def load(
@@ -97,8 +84,7 @@ def load(
         shapes = Shapes(
             **{**content["shapes"], "image_shape": tuple(content["shapes"]["image_shape"])}
         )
-        config = {**BEFORE, **content["config"]}
-        module = MAKERS[found](shapes, device=device, seed=0, **options, **config)
+        module = MAKERS[found](shapes, device=device, seed=0, **options, **content["config"])
         module.load_state_dict(weights)
     except torch.OutOfMemoryError:
         raise  # says nothing against the file
@@ -127,8 +113,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise UserError(
-                    f"{path} is no network of ifo-grounding (format {metadata.get('format')!r}, "
-                    f"expected {FORMAT!r}): pass a file that networks.save wrote"
+                    f"{path} is no network of this version of ifo-grounding (format "
+                    f"{metadata.get('format')!r}, expected {FORMAT!r}): train it again"
                 )
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         return json.loads(metadata["network"]), weights

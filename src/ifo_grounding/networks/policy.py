@@ -8,17 +8,17 @@ from typing import Any
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.data import Categorical as CategoricalSpec
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from ifo_grounding import keys
-from ifo_grounding.networks.building import Shareable, blueprint, check_keys, construct
+from ifo_grounding.networks.building import Blueprint, Shareable, build
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.shapes import Shapes, check_categorical
-from ifo_grounding.networks.transfer import copy_weights, trunk_of
 from ifo_grounding.networks.trunk import InstructedNetwork
+from ifo_grounding.networks.warm_start import instructed_network, start_trunk
 
 INPUTS: tuple[NestedKey, NestedKey] = (keys.PIXELS, keys.INSTRUCTION)
 
@@ -64,7 +64,7 @@ def make_policy(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"film"`` or ``"paper"``.
+        preset: ``"strong"`` or ``"paper"``.
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         action_key: where the action goes; its log-probability goes beside it, as TorchRL names it.
         logits_key: where the logits go, float32 [*B, A].
@@ -86,29 +86,33 @@ def make_policy(
     >>> step["action"].shape, step["action_log_prob"].shape
     (torch.Size([2]), torch.Size([2]))
     """
-    check_keys(in_keys, ("image", "instruction"))
     check_categorical(spec_source)
-    options = {
-        "in_keys": list(in_keys),
-        "action_key": action_key,
-        "logits_key": logits_key,
-        "deterministic": deterministic,
-    }
-    plan = blueprint("policy", spec_source, preset, options, overrides)
-    network = construct(PolicyNetwork, plan, device, seed)
-    policy = Policy(
-        TensorDictModule(network, in_keys=list(in_keys), out_keys=[logits_key]),
-        in_keys={"logits": logits_key},
-        out_keys=[action_key],
-        spec=CategoricalSpec(plan.shapes.n_actions, device=device),
-        distribution_class=Categorical,
-        return_log_prob=True,
-        default_interaction_type=(
-            InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
-        ),
+
+    def actor(network: nn.Module, plan: Blueprint) -> Policy:
+        kind = InteractionType.DETERMINISTIC if deterministic else InteractionType.RANDOM
+        return Policy(
+            TensorDictModule(network, in_keys=plan.options["in_keys"], out_keys=[logits_key]),
+            in_keys={"logits": logits_key},
+            out_keys=[action_key],
+            spec=CategoricalSpec(plan.shapes.n_actions, device=device),
+            distribution_class=Categorical,
+            return_log_prob=True,
+            default_interaction_type=kind,
+        )
+
+    keywords = {"action_key": action_key, "logits_key": logits_key, "deterministic": deterministic}
+    return build(
+        "policy",
+        PolicyNetwork,
+        spec_source,
+        preset,
+        ("image", "instruction"),
+        {"in_keys": in_keys, **keywords},
+        device=device,
+        seed=seed,
+        overrides=overrides,
+        wrap=actor,
     )
-    policy.network_config = plan
-    return policy.eval()
 
 
 def make_value(
@@ -126,8 +130,9 @@ def make_value(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"film"`` or ``"paper"``, all without dropout.
-        init_from: a policy of the same preset and sizes whose trunk's weights are copied.
+        preset: ``"strong"`` or ``"paper"``, all without dropout.
+        init_from: a policy of the same preset and sizes whose trunk's weights are copied (a warm
+            start).
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         out_key: where the value goes.
         device: where to build it.
@@ -143,12 +148,43 @@ def make_value(
     >>> value(pixels=torch.zeros(2, 3, 48, 48), instruction=torch.ones(2, 16)).shape
     torch.Size([2, 1])
     """
-    check_keys(in_keys, ("image", "instruction"))
-    options = {"in_keys": list(in_keys), "out_key": out_key}
-    plan = blueprint("value", spec_source, preset, options, overrides)
-    network = construct(ValueNetwork, plan, device, seed)
+    value = build(
+        "value",
+        ValueNetwork,
+        spec_source,
+        preset,
+        ("image", "instruction"),
+        {"in_keys": in_keys, "out_key": out_key},
+        device=device,
+        seed=seed,
+        overrides=overrides,
+        wrap=lambda network, plan: Value(network, plan.options["in_keys"], [out_key]),
+    )
     if init_from is not None:
-        copy_weights([(trunk_of(init_from), network.trunk)], init_from, plan)
-    value = Value(network, in_keys=list(in_keys), out_keys=[out_key])
-    value.network_config = plan
-    return value.eval()
+        start_trunk(value.module, init_from)
+    return value
+
+
+def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Tensor:
+    """Return how each map of a policy weighs the cells of images, in the light of instructions.
+
+    The maps are the word maps of the preset ``strong``, each read as evidence for places and as
+    evidence against them, and of ``paper`` what all gates together let through.
+
+    Args:
+        policy: built by ``make_policy``.
+        pixels: uint8 [N, C, H, W].
+        instruction: token ids, int64 [N, L].
+
+    Returns:
+        Weights, float32 [N, M, h, w], which sum to 1 over the cells of a map.
+
+    >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
+    >>> words = torch.ones(2, 16, dtype=torch.int64)
+    >>> attention_maps(policy, torch.zeros(2, 3, 48, 48), words).shape
+    torch.Size([2, 16, 6, 6])
+    """
+    network = instructed_network(policy)
+    image, _ = network.flat_pixels(pixels)
+    maps = network.trunk.maps(image, instruction).float()
+    return maps.unflatten(-1, network.grid)

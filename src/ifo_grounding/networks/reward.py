@@ -11,11 +11,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from ifo_grounding import keys
-from ifo_grounding.networks.building import blueprint, check_keys, construct, wrap
+from ifo_grounding.networks.base import same_batch
+from ifo_grounding.networks.building import build
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.shapes import Shapes
-from ifo_grounding.networks.transfer import copy_weights, trunk_of
-from ifo_grounding.networks.trunk import InstructedNetwork, same_batch
+from ifo_grounding.networks.trunk import InstructedNetwork
+from ifo_grounding.networks.warm_start import start_trunk
 
 
 class RewardNetwork(InstructedNetwork):
@@ -52,13 +53,13 @@ def make_reward_model(
 
     Args:
         spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"``, ``"film"`` or ``"paper"``.
+        preset: ``"strong"`` or ``"paper"``.
         in_keys: the image, uint8 [*B, C, H, W], the instruction, int64 [*B, L], and the action,
             integer [*B].
         out_key: where the logit goes.
-        init_from: a policy of the same preset, ``"film"`` or ``"paper"``, and the same sizes, whose
-            trunk's weights are copied. Practice leads a policy to what its judge likes best, so
-            that the judge has to know as much (an extension of the paper).
+        init_from: a policy of the same preset and sizes whose trunk's weights are copied (a warm
+            start, an extension of the paper). Self-examination leads a policy to what its reward
+            model likes best, so that this has to know as much.
         device: where to build it.
         seed: makes the initial weights a function of the seed alone.
         overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
@@ -72,10 +73,17 @@ def make_reward_model(
     >>> rwd(pixels=image, instruction=words, action=torch.tensor([0, 5])).shape
     torch.Size([2, 1])
     """
-    check_keys(in_keys, ("image", "instruction", "action"))
-    options = {"in_keys": list(in_keys), "out_key": out_key}
-    plan = blueprint("reward", spec_source, preset, options, overrides)
-    network = construct(RewardNetwork, plan, device, seed)
+    model: TensorDictModule = build(
+        "reward",
+        RewardNetwork,
+        spec_source,
+        preset,
+        ("image", "instruction", "action"),
+        {"in_keys": in_keys, "out_key": out_key},
+        device=device,
+        seed=seed,
+        overrides=overrides,
+    )
     if init_from is not None:
-        copy_weights([(trunk_of(init_from), network.trunk)], init_from, plan)
-    return wrap(network, plan, in_keys, [out_key])
+        start_trunk(model.module, init_from)
+    return model

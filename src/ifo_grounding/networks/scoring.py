@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -12,63 +13,37 @@ from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.modules import hidden_from_python
-from ifo_grounding.networks.cells import (
-    Cells,
-    Groups,
-    Kinds,
-    group_cells,
-    look_up,
-    pair_up,
-)
+from ifo_grounding.networks.base import ImageNetwork, same_batch
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.fusion import (
-    CellCount,
-    GatedAttention,
-    ResidualBlock,
-    ResidualFiLM,
-    SpatialReadout,
-)
+from ifo_grounding.networks.layers import head
 from ifo_grounding.networks.shapes import Shapes
-from ifo_grounding.networks.trunk import (
-    Network,
-    cells_are_alone,
-    distinct_cells,
-    encode_instruction,
-    flatten_cells,
-    fuse_pairs,
-    grid,
-    head,
-    image_encoder,
-    instruction_encoder,
-    same_batch,
-)
+from ifo_grounding.networks.trunk import GatedTrunk
 
 SUREST = 0.98
 """The most that an estimate of densities alone lets one believe."""
-CELLS_AT_ONCE, ROWS_AT_ONCE = 1 << 16, 1 << 12
-"""Cells and pairs that are computed together, to bound memory."""
+PAIRS_AT_ONCE = 1 << 12
+"""Pairs of a scene and an instruction that are scored together, to bound memory."""
 
 
-def slices(size: int, at_once: int) -> list[slice]:
-    """Cut a range into parts; an empty range is one part.
-
-    >>> slices(5, 3)
-    [slice(0, 3, None), slice(3, 6, None)]
-    """
-    return [slice(begin, begin + at_once) for begin in range(0, max(size, 1), at_once)]
-
-
-class PairScorer(Network):
+class PairScorer(ImageNetwork):
     """Base of the networks that score how images and an instruction go together, in two halves.
 
     Images are encoded without the instruction and instructions without the images, so that N
     scenes against P instructions cost N + P encodings and N x P light scores.
+
+    Args:
+        shapes: sizes of inputs.
+        config: sizes of the network.
+        images: how many images are seen with one instruction.
     """
 
     prior: Tensor
     """Added to every logit: what is known of suitability before anything is seen, see below."""
     mixed: Tensor
     """1 where logits were learned against pairs of which some were suitable, else 0."""
+
+    head: nn.Module
+    """Maps what :meth:`_read` returns to a logit."""
 
     def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
         super().__init__(shapes, config)
@@ -128,162 +103,72 @@ class PairScorer(Network):
         raise NotImplementedError
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
-        """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
+        """Map token ids [*B, L] to features [*B, D]."""
         raise NotImplementedError
 
-    def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:
+    def encode_scenes(self, *pixels: Tensor) -> Any:
         """Encode images, each [N, C, H, W], for :meth:`score_candidates`.
 
         Returns:
-            Features [N, F, h, w], or what stands for them where cells repeat and that pays.
+            Features [N, F, h, w], or what stands for them where cells repeat.
         """
         return self.encode_pixels(*pixels)
 
-    def score_candidates(
-        self, scenes: Cells | Kinds | Tensor, words: Tensor, index: Tensor
-    ) -> Tensor:
+    def score_candidates(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor:
         """Score some instructions of a pool for each scene.
 
         Args:
-            scenes: N encoded scenes, from :meth:`encode_scenes`.
+            scenes: N encoded scenes, from :meth:`encode_scenes` or :meth:`encode_pixels`.
             words: encoded instructions [P, D], from :meth:`encode_instruction`.
             index: candidates of each scene, int64 [N, K].
 
         Returns:
             Logits, float32 [N, K].
         """
-        raise NotImplementedError
+        rows = max(1, PAIRS_AT_ONCE // max(index.shape[1], 1))
+        with self.autocast(words):
+            some = [slice(begin, begin + rows) for begin in range(0, max(len(index), 1), rows)]
+            parts = [
+                self.head(self._read(scenes[part], words, index[part])).squeeze(-1) for part in some
+            ]
+        return self._expected(torch.cat(parts))
 
-    def score(self, features: Tensor, instruction: Tensor) -> Tensor:
-        """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""
-        raise NotImplementedError
-
-    def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:
-        """Score every scene [N, F, h, w] with every instruction [P, D]: logits [N, P].
-
-        ``chunk`` bounds the pairs scored at once, so that they stay in the processor's cache.
-        """
+    def _read(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor:
+        """Read N scenes in the light of some instructions [N, K]: [N, K, size]."""
         raise NotImplementedError
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Score images, each [*B, C, H, W], with token ids [*B, L], the last input."""
         *pixels, instruction = inputs
-        if hidden_from_python(instruction):
-            return self.score(self.encode_pixels(*pixels), self.encode_instruction(instruction))
         images, batch = self.flat_images(*pixels)
         same_batch(images=batch, instruction=instruction.shape[:-1])
-        tokens, which = distinct_rows(instruction.reshape(-1, instruction.shape[-1]).long())
+        tokens = instruction.reshape(-1, instruction.shape[-1]).long()
+        if hidden_from_python(tokens):
+            which = torch.arange(len(tokens), device=tokens.device)
+        else:
+            tokens, which = distinct_rows(tokens)
         scenes, words = self.encode_scenes(*images), self.encode_instruction(tokens)
         return self.score_candidates(scenes, words, which.unsqueeze(1)).reshape(*batch, 1)
 
 
-class SentenceScorer(PairScorer):
-    """Scores images with an instruction that is one vector.
-
-    ``film`` scores by residual FiLM, attention maps that tell places, and counts of the cells
-    that fit; ``paper`` by gated attention.
-    """
+class GatedScorer(PairScorer):
+    """Scores images with an instruction that gates their features (``paper``)."""
 
     def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
         super().__init__(shapes, config, images)
-        self.image = image_encoder(shapes, config, images)
-        features = config.features
-        self.context = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
-        self.instruction = instruction_encoder(shapes, config)
-        self.paper = config.preset == "paper"
-        self.alone = cells_are_alone(config)
-        size = self.instruction.size
-        if self.paper:
-            self.fusion = nn.ModuleList([GatedAttention(size, features, config.sentence_rate)])
-            size = features * math.prod(grid(shapes, config))
-        else:
-            self.fusion = nn.ModuleList(
-                ResidualFiLM(size, features, config.kernel) for _ in range(config.n_blocks)
-            )
-            self.readout = SpatialReadout(
-                features, config.heads, config.values, grid(shapes, config)
-            )
-            self.count = CellCount(features, config.detectors)
-            size = self.readout.size + self.count.size
-        self.head = head(size, config, 1)
+        self.trunk = GatedTrunk(shapes, config, images)
+        self.head = head(self.trunk.size, config, 1)
 
     def _features(self, images: list[Tensor]) -> Tensor:
-        features: Tensor = self.context(self.image(torch.cat(images, -3)))
+        features: Tensor = self.trunk.image(torch.cat(images, -3))
         return features
 
-    def encode_instruction(self, instruction: Tensor) -> Tensor:  # noqa: D102
-        return encode_instruction(self.instruction, instruction)
+    def encode_instruction(self, instruction: Tensor) -> Tensor:
+        """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
+        encoded: Tensor = self.trunk.instruction(instruction)
+        return encoded
 
-    def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:  # noqa: D102
-        if self.alone:
-            images, _ = self.flat_images(*pixels)
-            with self.autocast(pixels[0]):
-                cells = distinct_cells(self.image, torch.cat(images, -3))
-            if cells is not None:
-                return cells
-        return self.encode_pixels(*pixels)
-
-    def score_candidates(
-        self, scenes: Cells | Kinds | Tensor, words: Tensor, index: Tensor
-    ) -> Tensor:
-        """Score some instructions of a pool for each scene: logits [N, K]; see the base class."""
-        rows, count = index.shape
-        which = index.flatten()
-        if isinstance(scenes, Tensor):
-            repeated = scenes.unsqueeze(1).expand(-1, count, *scenes.shape[1:]).flatten(0, 1)
-            return self.score(repeated, words[which]).reshape(rows, count)
-        assert isinstance(scenes, Cells)
-        groups = group_cells(scenes.index, self.readout.place).repeated(count)
-        pairs = pair_up(groups.cell, which, len(scenes.features), len(words))
-        with self.autocast(words):
-            parts = [
-                self._outlook(fuse_pairs(self.fusion, scenes.features, words, pairs[some]))
-                for some in slices(len(pairs), CELLS_AT_ONCE)
-            ]
-            outlook = [torch.cat(part) for part in zip(*parts, strict=True)]
-            outputs = [
-                self.head(self._read(outlook, pairs.index[some], groups[some]))
-                for some in slices(len(which), ROWS_AT_ONCE)
-            ]
-        return self._expected(torch.cat(outputs).reshape(rows, count))
-
-    def _outlook(self, fused: Tensor) -> list[Tensor]:
-        """Return all that is read of each cell, [Q, ...] each, of features [Q, F, 1, 1]."""
-        parts = (*self.readout.outlook(fused), self.count.outlook(fused))
-        return [part.flatten(1) for part in parts]
-
-    def _read(self, outlook: list[Tensor], index: Tensor, groups: Groups) -> Tensor:
-        """Read the cells of scenes, which lie at ``index`` [N, J] in the tables of the outlook."""
-        logits, seen, detected = (look_up(table, index) for table in outlook)
-        looked = self.readout.read(logits, seen, groups.mean, groups.number)
-        return torch.cat([looked, self.count.read(detected, groups.number)], -1)
-
-    def score(self, features: Tensor, instruction: Tensor) -> Tensor:
-        """Score features [*B, F, h, w] and [*B, D] that belong together: logits [*B, 1]."""
-        batch = features.shape[:-3]
-        same_batch(features=batch, instruction=instruction.shape[:-1])
-        with self.autocast(features):
-            cells = features.movedim(-3, -1)
-            fused = cells.reshape(-1, *cells.shape[-3:]).contiguous().movedim(-1, -3)
-            words = instruction.reshape(-1, instruction.shape[-1])
-            for fuse in self.fusion:
-                fused = fuse(fused, words)
-            outputs = self.head(self._summary(F.relu(fused)))
-        return self._expected(outputs.reshape(*batch, 1))
-
-    def _summary(self, fused: Tensor) -> Tensor:
-        if self.paper:
-            return flatten_cells(fused)
-        return torch.cat([self.readout(fused), self.count(fused)], -1)
-
-    def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:  # noqa: D102
-        scenes, pool = len(features), len(instruction)
-        pairs = torch.arange(scenes * pool, device=features.device)
-        cells = features.movedim(-3, -1).contiguous()
-        parts = [
-            self.score(
-                cells.index_select(0, part // pool).movedim(-1, -3), instruction[part % pool]
-            )
-            for part in pairs.split(chunk)
-        ]
-        return torch.cat(parts).reshape(scenes, pool) if parts else features.new_zeros(scenes, pool)
+    def _read(self, scenes: Tensor, words: Tensor, index: Tensor) -> Tensor:
+        cells = scenes.flatten(2).transpose(1, 2).unsqueeze(1)  # [N, 1, h * w, F]
+        gates = self.trunk.fusion.gates(words)[index].unsqueeze(2)  # [N, K, 1, F]
+        return F.relu(cells * gates).flatten(2)

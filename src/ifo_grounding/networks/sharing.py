@@ -13,7 +13,7 @@ from torch import nn
 from ifo_grounding.errors import UserError, extra
 from ifo_grounding.files import atomic_write, read_json, write_json
 from ifo_grounding.networks.building import Blueprint
-from ifo_grounding.networks.persistence import load, plan_of, save
+from ifo_grounding.networks.persistence import load, save
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -71,7 +71,7 @@ def save_pretrained(
     ...     from_pretrained(made).vocabulary.words
     ('go', 'up')
     """
-    folder, plan = Path(folder), plan_of(module)
+    folder, plan = Path(folder), Blueprint.of(module)
     if vocabulary is None:
         vocabulary = getattr(module, "vocabulary", None)
     if vocabulary is not None:
@@ -128,7 +128,7 @@ def from_pretrained(
         folder = _downloaded(str(source), hub)
     module = load(folder / WEIGHTS, device=device, kind=kind)
     words = folder / WORDS
-    module.vocabulary = _vocabulary(words, plan_of(module).shapes) if words.exists() else None
+    module.vocabulary = _vocabulary(words, Blueprint.of(module).shapes) if words.exists() else None
     return module
 
 

@@ -11,21 +11,14 @@ from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.modules import hidden_from_python
-from ifo_grounding.networks.cells import Cells, Kinds, group_cells, look_up
+from ifo_grounding.networks.appearance import ColourAndForm
+from ifo_grounding.networks.cells import Kinds, cell_places, group_cells, look_up
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.fusion import cell_places
-from ifo_grounding.networks.grounding import (
-    AROUND,
-    FORMS,
-    MANNER,
-    WordMaps,
-    surroundings,
-)
-from ifo_grounding.networks.looks import ColourAndForm
-from ifo_grounding.networks.scoring import ROWS_AT_ONCE, PairScorer, slices
+from ifo_grounding.networks.grounding import AROUND, FORMS, MODIFIER, WordMaps, surroundings
+from ifo_grounding.networks.layers import head
+from ifo_grounding.networks.scoring import PairScorer
 from ifo_grounding.networks.sentences import without_padding
 from ifo_grounding.networks.shapes import Shapes, patch_size
-from ifo_grounding.networks.trunk import grid, head, same_batch
 
 
 class Seen(NamedTuple):
@@ -50,9 +43,9 @@ class WordScorer(PairScorer):
     :class:`~ifo_grounding.networks.GroundedTrunk`, what lies around these places, whether there is
     one of them, and how many cells fit.
 
-    A policy asks where the evidence for a word is greatest; a judge, whether it is enough. What is
-    enough differs from word to word, so that each has a threshold of its own. It shifts what is
-    said of all cells alike, which leaves the places as they are and moves the counts.
+    A policy asks where the evidence for a word is greatest; a classifier, whether it is enough.
+    What is enough differs from word to word, so that each has a threshold of its own. It shifts
+    what is said of all cells alike, which leaves the places as they are and moves the counts.
 
     Args:
         shapes: sizes of inputs.
@@ -65,28 +58,28 @@ class WordScorer(PairScorer):
     def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
         super().__init__(shapes, config, images)
         channels = shapes.image_shape[0]
-        self.looks = ColourAndForm(channels, config.features, patch_size(shapes, config))
-        self.words = WordMaps(shapes.vocabulary_size, config.maps, config.hidden // 2)
+        self.appearance = ColourAndForm(channels, config.features, patch_size(shapes, config))
+        self.words = WordMaps(shapes.vocabulary_size, config.maps, config.hidden)
         self.attention = nn.Linear(images * config.features, config.heads)
         nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
         self.value = nn.Linear(images * config.features, config.values)
         self.form = nn.Linear(images * config.features, FORMS)
         self.around = nn.Conv2d(FORMS, AROUND, 3, padding=1)
-        self.register_buffer("place", cell_places(grid(shapes, config)), persistent=False)
+        self.register_buffer("place", cell_places(self.grid), persistent=False)
         self.known = shapes.vocabulary_size
         self.threshold = nn.Parameter(torch.zeros(shapes.vocabulary_size))
         maps = images * config.maps
         self.scale = nn.Parameter(torch.ones(maps))
         self.bias = nn.Parameter(torch.full((maps,), -4.0))  # most cells do not fit
         seen = config.heads * (2 + config.values + 2 * maps)
-        self.head = head(seen + 2 * maps * (3 + AROUND) + 2 * maps + MANNER, config, 1)
+        self.head = head(seen + 2 * maps * (3 + AROUND) + 2 * maps + MODIFIER, config, 1)
 
     def _features(self, images: list[Tensor]) -> Tensor:
         """Map images [N, C, H, W] to features [N, images * V + heads + values + AROUND, h, w]."""
         tables = self._tables(images)
         seen = self._seen(tables, [table.where for table in tables])
         features = torch.cat([seen, self._surroundings(tables)], -1)
-        return features.movedim(1, -1).unflatten(-1, grid(self.shapes, self.config))
+        return features.movedim(1, -1).unflatten(-1, self.grid)
 
     def _tables(self, images: list[Tensor]) -> list[Seen]:
         """See the distinct cells of each image."""
@@ -94,11 +87,11 @@ class WordScorer(PairScorer):
         weight = torch.cat([part.weight for part in heads])
         tables = []
         for image, part in zip(images, weight.chunk(self.images, -1), strict=True):
-            looks = self.looks(image)
-            colour, form = self.words.evidence(looks)
-            silent = F.linear(looks.silhouette, part)
+            cells = self.appearance(image)
+            colour, form = self.words.evidence(cells)
+            silent = F.linear(cells.silhouette, part)
             silent, forms = silent.split([silent.shape[-1] - FORMS, FORMS], -1)
-            tables.append(Seen(colour + form + self.threshold, silent, forms, looks.where))
+            tables.append(Seen(colour + form + self.threshold, silent, forms, cells.where))
         return tables
 
     def _seen(self, tables: list[Seen], cells: list[Tensor]) -> Tensor:
@@ -111,9 +104,9 @@ class WordScorer(PairScorer):
     def _surroundings(self, tables: list[Seen]) -> Tensor:
         """Return what lies around each cell, [N, h * w, AROUND]."""
         forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
-        return F.relu(surroundings(self.around, F.relu(forms), grid(self.shapes, self.config)))
+        return F.relu(surroundings(self.around, F.relu(forms), self.grid))
 
-    def encode_scenes(self, *pixels: Tensor) -> Cells | Kinds | Tensor:
+    def encode_scenes(self, *pixels: Tensor) -> Kinds | Tensor:
         """Encode images, each [N, C, H, W], those of their cells that look alike once."""
         if hidden_from_python(pixels[0]):
             return self.encode_pixels(*pixels)
@@ -125,100 +118,71 @@ class WordScorer(PairScorer):
             for table in tables[1:]:
                 index = index * len(table.said) + table.where
             place = self.place.to(around.dtype).expand(len(around), -1, -1)
-            groups = group_cells(index, torch.cat([place, around], -1))
+            kind, number, mean = group_cells(index, torch.cat([place, around], -1))
             cells: list[Tensor] = []
-            numbers = groups.cell
             for table in reversed(tables):
-                cells.insert(0, numbers % len(table.said))
-                numbers = numbers // len(table.said)
-            features = torch.cat([self._seen(tables, cells), groups.mean[..., 2:]], -1)
-        return Kinds(features.transpose(1, 2), groups.mean[..., :2], groups.number)
+                cells.insert(0, kind % len(table.said))
+                kind = kind // len(table.said)
+            features = torch.cat([self._seen(tables, cells), mean[..., 2:]], -1)
+        return Kinds(features.transpose(1, 2), mean[..., :2], number)
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
-        """Map token ids [*B, L] to how much each word counts, and the manner: [*B, D]."""
+        """Map token ids [*B, L] to how much each word counts, and the modifier: [*B, D]."""
         tokens = instruction.reshape(-1, instruction.shape[-1]).long()
         which = None
         if tokens.numel() and not hidden_from_python(tokens):
             tokens, which = distinct_rows(tokens)
             tokens = without_padding(tokens, self.known)
         with torch.autocast(tokens.device.type, enabled=False):
-            spoken, manner = self.words.listen(tokens)
-            words = torch.cat([spoken.flatten(1), manner], -1)
+            spoken, modifier = self.words.listen(tokens)
+            words = torch.cat([spoken.flatten(1), modifier], -1)
         words = words if which is None else look_up(words, which)
         return words.reshape(*instruction.shape[:-1], words.shape[-1])
 
-    def score_candidates(
-        self, scenes: Cells | Kinds | Tensor, words: Tensor, index: Tensor
-    ) -> Tensor:
-        """Score some instructions of a pool for each scene: logits [N, K]; see the base class."""
+    def _read(self, scenes: Kinds | Tensor, words: Tensor, index: Tensor) -> Tensor:
+        # Cells are the second dimension throughout: on a CPU a softmax over a last dimension of a
+        # dozen takes thirty times as long.
         if isinstance(scenes, Tensor):
-            cells = scenes.flatten(2)
-            number = cells.new_ones(cells.shape[-1]).expand(len(cells), -1)
-            scenes = Kinds(cells, self.place.expand(len(cells), -1, -1), number)
-        assert isinstance(scenes, Kinds)
-        rows = max(1, ROWS_AT_ONCE // max(index.shape[1], 1))
-        with self.autocast(words):
-            parts = [
-                self.head(self._read(scenes[some], words, index[some])).squeeze(-1)
-                for some in slices(len(index), rows)
-            ]
-        return self._expected(torch.cat(parts))
-
-    def _read(self, scenes: Kinds, words: Tensor, index: Tensor) -> Tensor:
-        """Read N scenes in the light of some instructions [N, K]: [N, K, size].
-
-        Cells are the second dimension throughout: on a CPU a softmax over a last dimension of a
-        dozen takes thirty times as long.
-        """
+            every = scenes.flatten(2)
+            ones = every.new_ones(len(every), every.shape[-1])
+            scenes = Kinds(every, self.place.expand(len(every), -1, -1), ones)
         cells, place = scenes.features, scenes.place.to(scenes.features.dtype)
         number = scenes.number.to(cells.dtype)  # [N, C]
-        each = number.clamp_min(1)
-        count, maps = index.shape[1], self.config.maps
-        spoken, manner = words[:, :-MANNER], words[:, -MANNER:]
-        weights = spoken.unflatten(1, (self.known, maps)).transpose(1, 2)[index]  # [N, K, maps, V]
-        said = cells[:, : self.images * self.known].unflatten(1, (self.images, self.known))
-        told = said.transpose(2, 3) @ weights.flatten(1, 2).unsqueeze(1).transpose(2, 3)
-        logits = told.unflatten(3, (count, maps)).permute(0, 2, 3, 1, 4).flatten(3)
-        prior = number.log()
-        both = torch.cat([logits, -logits], 3)
-        looked = (both + prior[..., None, None]).softmax(1)  # [N, C, K, 2 * images * maps]
-        pairs = looked.flatten(2).transpose(1, 2)  # [N, K * 2 * images * maps, C]
-        silent, around = cells[:, self.images * self.known :].split(
-            [cells.shape[1] - self.images * self.known - AROUND, AROUND], 1
-        )
+        each, prior = number.clamp_min(1), number.log()
+        count = index.shape[1]
+        logits = self._pointed(cells, words[:, :-MODIFIER], index)
+        weighed = (torch.cat([logits, -logits], 3) + prior[..., None, None]).softmax(1)
+        known = self.images * self.known
+        silent, around = cells[:, known:].split([cells.shape[1] - known - AROUND, AROUND], 1)
         heads = self.attention.out_features
         attention = (silent[:, :heads] + prior[..., None, :]).softmax(-1)  # [N, heads, C]
         seen = torch.cat([attention @ place, attention @ silent[:, heads:].transpose(1, 2)], -1)
         shared = (attention / each[..., None, :]).transpose(1, 2)
         there = torch.cat([shared, place, around.transpose(1, 2)], -1)
-        found = (pairs @ there).unflatten(1, looked.shape[2:])  # [N, K, 2 * images * maps, ...]
-        beside, where, what = found.split([heads, 2, AROUND], -1)
+        pairs = weighed.flatten(2).transpose(1, 2)  # [N, K * 2 * images * maps, C]
+        found = (pairs @ there).unflatten(1, weighed.shape[2:])  # [N, K, 2 * images * maps, ...]
         fit = torch.sigmoid(self.scale * logits + self.bias)
         fits = (fit * number[..., None, None]).sum(1)
         parts = [
             seen.flatten(1).unsqueeze(1).expand(-1, count, -1),
-            beside.flatten(2),
-            where.flatten(2),
-            what.flatten(2),
-            (looked / each[..., None, None]).amax(1),
+            *(part.flatten(2) for part in found.split([heads, 2, AROUND], -1)),
+            (weighed / each[..., None, None]).amax(1),
             fits,
             torch.tanh(fits),
-            manner[index],
+            words[:, -MODIFIER:][index],
         ]
         return torch.cat(parts, -1)
 
-    def score(self, features: Tensor, instruction: Tensor) -> Tensor:  # noqa: D102
-        batch = features.shape[:-3]
-        same_batch(features=batch, instruction=instruction.shape[:-1])
-        words = instruction.reshape(-1, instruction.shape[-1])
-        own = torch.arange(len(words), device=words.device).unsqueeze(1)
-        scenes = features.reshape(-1, *features.shape[-3:])
-        return self.score_candidates(scenes, words, own).reshape(*batch, 1)
+    def _pointed(self, cells: Tensor, spoken: Tensor, index: Tensor) -> Tensor:
+        """Return the maps' logits of cells [N, F, C] for instructions: [N, C, K, images * maps].
 
-    def score_all(self, features: Tensor, instruction: Tensor, chunk: int = 2048) -> Tensor:  # noqa: D102
-        every = torch.arange(len(instruction), device=features.device)
-        parts = [
-            self.score_candidates(part, instruction, every.expand(len(part), -1))
-            for part in features.split(max(1, chunk // max(len(instruction), 1)))
-        ]
-        return torch.cat(parts)
+        Args:
+            cells: features of N scenes.
+            spoken: how much each word counts for each map, of a pool of instructions [P, V * maps].
+            index: which of these each scene is read with, [N, K].
+        """
+        maps = self.config.maps
+        weights = spoken.unflatten(1, (self.known, maps)).transpose(1, 2)[index]  # [N, K, maps, V]
+        said = cells[:, : self.images * self.known].unflatten(1, (self.images, self.known))
+        told = said.transpose(2, 3) @ weights.flatten(1, 2).unsqueeze(1).transpose(2, 3)
+        return told.unflatten(3, (index.shape[1], maps)).permute(0, 2, 3, 1, 4).flatten(3)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.modules import charges, hidden_from_python, output_key
+from ifo_grounding.modules import has_word_penalty, hidden_from_python, output_key
 
 
 @contextlib.contextmanager
@@ -44,7 +44,7 @@ class SupervisedLoss(LossModule):
     is back in the mode it had, so a policy that collects in eval mode stays in it.
 
     Args:
-        network: the network to train.
+        network: the network to train, used as it is: nothing is copied or made stateless.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the losses of the samples. Metrics are
             always means.
 
@@ -54,7 +54,7 @@ class SupervisedLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        action: NestedKey = "action"
+        """No keys but the network's."""
 
     default_keys: Any = _AcceptedKeys
     tensor_keys: Any
@@ -70,32 +70,28 @@ class SupervisedLoss(LossModule):
 
     @property
     def functional(self) -> bool:
-        """The network is used as it is: nothing is copied or made stateless."""
+        """Not functional: the network is used as it is."""
         return False
 
     @property
     def capturable(self) -> bool:
-        """Whether all steps do the same, so that a GPU may be told of them once (a CUDA graph)."""
-        return False
+        """Whether a training step can be captured as a CUDA graph: all steps do the same.
 
-    def _steps_alike(self) -> bool:
-        """Whether no words are charged for, and no numbers drawn from a generator of its own."""
-        parts = [getattr(part, "generator", None) for part in self.modules()]
-        return not charges(self.network) and all(part is None for part in parts)
+        They do not where a network looks at which words a batch says, or where random numbers come
+        from a generator of the loss.
+        """
+        own = any(getattr(part, "generator", None) is not None for part in self.modules())
+        return not own and not has_word_penalty(self.network)
 
     def _own_keys(self) -> list[NestedKey]:
         """Return the keys that are read because the network reads them."""
         return list(self.network.in_keys)
 
-    def _extra_keys(self) -> list[NestedKey]:
-        """Return the keys read besides the network's own."""
-        return [self.tensor_keys.action]
-
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Every key that :meth:`forward` reads."""
+        """Every key that :meth:`forward` reads: the network's, and those of ``set_keys``."""
         own = self._own_keys()
-        return own + [key for key in self._extra_keys() if key not in own]
+        return own + [key for key in vars(self.tensor_keys).values() if key not in own]
 
     @in_keys.setter
     def in_keys(self, values: object) -> None:
@@ -135,8 +131,8 @@ def scalars(**values: Tensor) -> TensorDict:
 def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = None) -> None:
     """Raise :class:`UserError` unless ``action`` has the shape that the network acts in.
 
-    Where ``count`` actions are known, indices have to be of them; on a CPU, for elsewhere to look
-    is to wait, and not where ``torch.vmap`` or the compiler hides them.
+    Where ``count`` actions are known, indices have to be of them. On a GPU, which would have to be
+    waited for, and inside the compiler they are not checked.
     """
     if tuple(action.shape) != tuple(expected):
         raise UserError(

@@ -29,11 +29,12 @@ class GoalLoss(SupervisedLoss):
     ``removed``.
 
     Args:
-        network: first image, image and instruction to a logit, as ``make_goal_judge`` builds it.
+        network: first image, image and instruction to a logit, as ``make_goal_classifier`` builds
+            it.
         pool: token ids [P, L] of the instructions of the demonstrations.
         negatives: how many other instructions each final frame is scored with.
-        removal_rate: share of a batch's other instructions to remove, those scored highest, or
-            ``"estimated"``.
+        removal_rate: share of a batch's other instructions to remove, those scored highest; None
+            estimates it.
         warmup: share of training before which none is removed; see :meth:`set_progress`.
         near: share of the other instructions that differ from the own one in few words.
         generator: where random numbers come from; None is the global generator.
@@ -41,11 +42,11 @@ class GoalLoss(SupervisedLoss):
     Raises:
         UserError: for a pool of fewer than two different instructions, or values out of range.
 
-    >>> from ifo_grounding.networks import Shapes, make_goal_judge
+    >>> from ifo_grounding.networks import Shapes, make_goal_classifier
     >>> pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
-    >>> judge = make_goal_judge(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
+    >>> network = make_goal_classifier(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
     >>> frames = torch.zeros(4, 3, 48, 48, dtype=torch.uint8)
-    >>> losses = GoalLoss(judge, pool)(TensorDict({
+    >>> losses = GoalLoss(network, pool)(TensorDict({
     ...     "initial_pixels": frames, "pixels": frames, "instruction": pool[:4],
     ...     "final": torch.tensor([[True], [False], [False], [True]]),
     ... }, [4]))
@@ -75,14 +76,13 @@ class GoalLoss(SupervisedLoss):
         pool: Tensor,
         *,
         negatives: int = 8,
-        removal_rate: float | str = 0.0,
+        removal_rate: float | None = 0.0,
         warmup: float = 1 / 3,
         near: float = 0.0,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
-        negatives = at_least_one("negatives", negatives)
-        self.count = negatives
+        self.count = at_least_one("negatives", negatives)
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator, near)
 
     def set_progress(self, fraction: float) -> None:
@@ -91,11 +91,8 @@ class GoalLoss(SupervisedLoss):
 
     @property
     def capturable(self) -> bool:
-        """Whether all steps do the same: how many negatives to drop would have to be counted."""
-        return self.negatives.keeps_all and self._steps_alike()
-
-    def _extra_keys(self) -> list[NestedKey]:
-        return [self.tensor_keys.final]
+        """Whether a step can be captured: removal would have to count what it drops."""
+        return self.negatives.keeps_all and super().capturable
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -105,7 +102,7 @@ class GoalLoss(SupervisedLoss):
         final = batch.get(self.tensor_keys.final).reshape(-1).bool()
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():
-            if final.is_cuda and self.capturable:  # all in every way: to count them is to wait
+            if final.is_cuda and self.capturable:  # score all: counting them would wait for the GPU
                 own, other = pair_scores(self.network, batch, others, self.output)
                 early, last, before = own, final, ~final
                 told = final.unsqueeze(1).expand_as(other)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
 from tensordict.utils import NestedKey
-from torch.distributions import Categorical
+from torch.distributions import Categorical, Distribution
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import charges, set_lenient, take_charge
+from ifo_grounding.modules import has_word_penalty, set_word_swapping, take_word_penalty
 from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
 
 CONFIDENCE = 4
-"""Power of the likelihood by which words are charged: who is still at sea pays little."""
+"""Power of the likelihood that weighs the word penalty: a policy that knows little pays little."""
 
 
 class ImitationLoss(SupervisedLoss):
@@ -27,18 +26,19 @@ class ImitationLoss(SupervisedLoss):
     takes integer actions for logits.
 
     Of a network with :class:`~ifo_grounding.networks.WordMaps`, which reads word by word, it also
-    writes ``loss_words``: what its words say about colours and about form is charged for, the more
-    the better the actions are predicted. A word that needs but one of the two then keeps to it.
+    writes ``loss_words``, which regularises what words say about colours and about form; its weight
+    grows with the likelihood of the actions. A word that needs but one of the two then keeps to it.
     Train such a network eagerly: inside ``torch.compile`` it does not tell words apart that occur
-    from those that do not, and nothing is charged.
+    from those that do not, and there is no penalty.
 
     Args:
-        network: a policy with ``get_dist``, as ``make_policy`` builds it.
+        network: a policy with ``get_dist``, such as ``make_policy`` or TorchRL's
+            ``ProbabilisticActor`` give, or a ``TensorDictSequential`` that contains one.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
-        charge: weight of ``loss_words``.
-        strict_from: share of training, see :meth:`set_progress`, before which words are neither
-            charged for nor swapped. Where actions are easy to guess without words, they are
-            otherwise held to one meaning before they have any.
+        word_penalty: weight of ``loss_words``.
+        words_from: share of training, see :meth:`set_progress`, before which words are neither
+            penalised nor swapped. Where actions are easy to guess without words, they are otherwise
+            held to one meaning before they have any.
 
     >>> import torch
     >>> from ifo_grounding.networks import Shapes, make_policy
@@ -59,74 +59,72 @@ class ImitationLoss(SupervisedLoss):
         """The labelled action, integer [*B]."""
 
     default_keys: Any = _AcceptedKeys
-    _selected: list[NestedKey] | None = None
 
     def __init__(
         self,
-        network: TensorDictModule,
+        network: TensorDictModuleBase,
         *,
         reduction: str = "mean",
-        charge: float = 0.02,
-        strict_from: float = 0.0,
+        word_penalty: float = 0.02,
+        words_from: float = 0.0,
     ) -> None:
+        if not _gives_distribution(network):
+            raise UserError(
+                f"ImitationLoss trains policies with get_dist, as make_policy or TorchRL's "
+                f"ProbabilisticActor give, or a TensorDictSequential with one in it, got "
+                f"{type(network).__name__}"
+            )
         super().__init__(network, reduction=reduction)
-        if not 0 <= strict_from <= 1:
-            raise UserError(f"strict_from is a share of training in [0, 1], got {strict_from}")
-        self.charge = charge
-        self.strict_from = strict_from
-        self.strict: bool | None = None  # nobody knows how an earlier loss left the network
+        if not 0 <= words_from <= 1:
+            raise UserError(f"words_from is a share of training in [0, 1], got {words_from}")
+        words = ["loss_words"] if has_word_penalty(network) else []
+        self.out_keys = ["loss_imitation", *words, "accuracy", "entropy"]
+        self.word_penalty = word_penalty
+        self.words_from = words_from
         self.set_progress(0.0)
-
-    @property
-    def capturable(self) -> bool:
-        """Whether all steps do the same: where words are charged for, they are looked at."""
-        return self._steps_alike()
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """What is written, ``loss_words`` while a network learns that reads word by word."""
-        return self._all_out_keys() if self._selected is None else self._selected
-
-    @out_keys.setter
-    def out_keys(self, names: Sequence[NestedKey]) -> None:
-        """Write these alone (``select_out_keys``), or all again."""
-        self._selected = None if list(names) == self._all_out_keys() else list(names)
-
-    def _all_out_keys(self) -> list[NestedKey]:
-        charged = self.training and charges(self.network)
-        words: list[NestedKey] = ["loss_words"] if charged else []
-        return ["loss_imitation", *words, "accuracy", "entropy"]
 
     def set_progress(self, fraction: float) -> None:
         """Say which share of training is done."""
-        strict = fraction >= self.strict_from
-        if strict == self.strict:
-            return
-        self.strict = strict
-        set_lenient(self.network, not strict)
+        self.holds_words = fraction >= self.words_from
+        set_word_swapping(self.network, self.holds_words)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of a batch of labelled transitions."""
         self._require(tensordict)
         action = tensordict.get(self.tensor_keys.action)
-        take_charge(self.network)  # of what another loss looked at
+        take_word_penalty(self.network)  # that another loss left
         with self._mode():
-            dist = self.network.get_dist(tensordict.select(*self.network.in_keys))
+            dist = _distribution(self.network, tensordict.select(*self.network.in_keys))
         likeliest = dist.mode
         count = dist.logits.shape[-1] if isinstance(dist, Categorical) else None
         check_action(action, likeliest.shape, count)
         loss = -dist.log_prob(action)
         right = (likeliest == action).reshape(*loss.shape, -1).all(-1)
-        charged = take_charge(self.network)
-        words = {}
-        if charged is not None:
+        penalty = take_word_penalty(self.network)  # none in eval mode
+        losses = {"loss_imitation": self._reduce_loss(loss, tensordict)}
+        if "loss_words" in self.out_keys:
             likelihood = (-self._mean(loss, tensordict)).exp()
-            weight = self.charge if self.strict else 0.0
-            words = {"loss_words": weight * likelihood**CONFIDENCE * charged}
-        return scalars(
-            loss_imitation=self._reduce_loss(loss, tensordict),
-            **words,
-            accuracy=self._mean(right, tensordict),
-            entropy=self._mean(dist.entropy(), tensordict),
-        )
+            weight = self.word_penalty if self.holds_words else 0.0
+            penalty = likelihood.new_zeros(()) if penalty is None else penalty
+            losses["loss_words"] = weight * likelihood**CONFIDENCE * penalty
+        accuracy, entropy = self._mean(right, tensordict), self._mean(dist.entropy(), tensordict)
+        return scalars(**losses, accuracy=accuracy, entropy=entropy)
+
+
+def _gives_distribution(module: object) -> bool:
+    """Whether a policy, or a part of it, has ``get_dist``."""
+    parts = module.module if isinstance(module, TensorDictSequential) else ()
+    return hasattr(module, "get_dist") or any(map(_gives_distribution, parts))
+
+
+def _distribution(module: Any, inputs: TensorDictBase) -> Distribution:
+    """Return the distribution of actions, of the last part of a sequence that gives one."""
+    if hasattr(module, "get_dist"):
+        return module.get_dist(inputs)
+    parts = list(module.module)
+    while not _gives_distribution(parts[-1]):
+        parts.pop()
+    for part in parts[:-1]:
+        inputs = part(inputs)
+    return _distribution(parts[-1], inputs)

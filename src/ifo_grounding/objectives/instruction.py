@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.modules import set_lenient
+from ifo_grounding.modules import set_word_swapping
 from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
-from ifo_grounding.objectives.pairs import (
-    ESTIMATED,
-    NegativeInstructions,
-    masked_mean,
-    pair_scores,
-)
+from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
-UNLABELLED = ("removal", "non-negative", "mixture")
+UNLABELLED = ("removal", "mixture")
+"""What can be done about false negatives."""
 
 
 class InstructionLoss(SupervisedLoss):
@@ -53,20 +46,18 @@ class InstructionLoss(SupervisedLoss):
         pool: token ids [P, L] of the instructions of the demonstrations.
         negatives: how many negatives each scene is scored with, at most as many as there are other
             instructions; they share its image's encoding.
-        removal_rate: share of a batch's negatives to remove, those scored highest; with
-            ``"estimated"``, as large as their scores say that the share of suitable ones is.
+        removal_rate: share of a batch's negatives to remove, those scored highest; None estimates
+            from their scores how many are suitable.
         warmup: share of training before which none is removed; see :meth:`set_progress`.
         contrast: weight of the contrast, in nats.
         unlabelled: what is done about false negatives. ``"removal"`` drops the negatives scored
-            highest; ``"non-negative"`` drops none, but takes the share's worth of the positives'
-            loss off the negatives' loss, which is kept from falling below zero (nnPU, Kiryo et al.
-            2017, with both classes weighing the same). ``"mixture"`` drops none either:
-            :meth:`calibrate` then counts how many suitable ones they hold (Elkan and Noto 2008).
+            highest; ``"mixture"`` drops none: :meth:`calibrate` then counts how many suitable ones
+            they hold (Elkan and Noto 2008).
         near: share of the negatives that differ from the own instruction in few words.
         states: images of fresh states of the simulator, uint8 [S, C, H, W].
         fresh: how many of these, drawn anew for each batch, every instruction of it is scored with.
-        strict: whether words are swapped for others in training where the network reads word by
-            word (``"strong"``), so that what they count for cannot depend on which they are: for
+        swap_words: whether training swaps words for others where the network reads word by word
+            (``"strong"``), so that what they count for cannot depend on which they are: for
             combinations that no demonstration names. It takes many demonstrations to learn so.
         generator: where random numbers come from; None is the global generator.
 
@@ -86,11 +77,6 @@ class InstructionLoss(SupervisedLoss):
 
     states: Tensor | None
 
-    @dataclass
-    class _AcceptedKeys:
-        """No keys of its own: all it reads are the network's."""
-
-    default_keys: Any = _AcceptedKeys
     written = keys.SUITABILITY
     out_keys = [  # noqa: RUF012
         "loss_instruction",
@@ -105,14 +91,14 @@ class InstructionLoss(SupervisedLoss):
         pool: Tensor,
         *,
         negatives: int = 8,
-        removal_rate: float | str = ESTIMATED,
+        removal_rate: float | None = None,
         warmup: float = 1 / 3,
         contrast: float = 0.0,
         unlabelled: str = "removal",
         near: float = 0.0,
         states: Tensor | None = None,
         fresh: int = 32,
-        strict: bool = False,
+        swap_words: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
@@ -127,7 +113,7 @@ class InstructionLoss(SupervisedLoss):
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator, near)
         self.count = min(negatives, len(self.negatives.pool) - 1)
         self.fresh = fresh
-        set_lenient(network, not strict)
+        set_word_swapping(network, swap_words)
         self.register_buffer("states", states, persistent=False)
 
     def set_progress(self, fraction: float) -> None:
@@ -164,12 +150,9 @@ class InstructionLoss(SupervisedLoss):
 
     @property
     def capturable(self) -> bool:
-        """Whether all steps do the same: how many negatives to drop would have to be counted."""
+        """Whether a step can be captured: removal would have to count what it drops."""
         keeps_all = self.unlabelled == "mixture" or self.negatives.keeps_all
-        return keeps_all and self._steps_alike()
-
-    def _extra_keys(self) -> list[NestedKey]:
-        return []
+        return keeps_all and super().capturable
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -186,14 +169,8 @@ class InstructionLoss(SupervisedLoss):
             near = slice(self.negatives.uniform(self.count), self.count)
             random = torch.cat([other[:, : near.start], other[:, near.stop :]], 1)
             self.negatives.watch(own, random)
-        if self.unlabelled == "removal":
-            kept = self.negatives.keep(other)
-            refused = masked_mean(F.softplus(other), kept)
-        else:
-            kept = torch.ones_like(other, dtype=torch.bool)
-            mixture = self.unlabelled == "mixture"
-            refused = F.softplus(other).mean() if mixture else self._non_negative(own, other)
-        loss = (F.softplus(-own).mean() + refused) / 2
+        kept = self._kept(other)
+        loss = (F.softplus(-own).mean() + masked_mean(F.softplus(other), kept)) / 2
         if self.contrast:
             told = other.masked_fill(~kept, -torch.inf)
             kinds = [self.count] if self.states is None else [self.count, self.fresh]
@@ -207,6 +184,12 @@ class InstructionLoss(SupervisedLoss):
             removed=1 - self._mean(kept),
         )
 
+    def _kept(self, other: Tensor) -> Tensor:
+        """Return which negatives count, a mask of their logits."""
+        if self.unlabelled == "mixture":
+            return torch.ones_like(other, dtype=torch.bool)
+        return self.negatives.keep(other)
+
     def _elsewhere(self, batch: TensorDictBase) -> Tensor:
         """Score each row's own instruction in some fresh states: logits [N, fresh]."""
         assert self.states is not None
@@ -216,9 +199,3 @@ class InstructionLoss(SupervisedLoss):
         scenes = TensorDict({image: self.states[rows], instruction: spoken[:, 0]}, [self.fresh])
         first, others = pair_scores(self.network, scenes, spoken[:, 1:], self.output)
         return torch.cat([first.unsqueeze(1), others], 1).T
-
-    def _non_negative(self, own: Tensor, other: Tensor) -> Tensor:
-        """Estimate the loss of true negatives from that of unlabelled pairs and of positives."""
-        share = self.negatives.share
-        risk = (F.softplus(other).mean() - share * F.softplus(own).mean()) / (1 - share)
-        return risk.abs()  # where it falls below zero, its gradient is turned round

@@ -43,7 +43,6 @@ class InverseLoss(SupervisedLoss):
     default_keys: Any = _AcceptedKeys
     out_keys = ["loss_inverse", "accuracy"]  # noqa: RUF012
     written = keys.LOGITS
-    capturable = True
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

@@ -14,7 +14,6 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.modules import output_key
 from ifo_grounding.objectives.mixture import MixtureEstimate
 
-ESTIMATED = "estimated"
 MOST_REMOVED = 0.5
 LEAST_REMOVED = 0.05
 """Where fewer pairs than this are suitable, false negatives hardly matter, and what an imperfect
@@ -38,7 +37,7 @@ class NegativeInstructions(nn.Module):
 
     Args:
         pool: token ids [P, L]; repeated rows count once.
-        removal_rate: share of negatives to drop, in [0, 1), or ``"estimated"``.
+        removal_rate: share of negatives to drop, in [0, 1); None estimates it.
         warmup: share of training before which none is dropped.
         near: share of the negatives that are drawn among the ``NEAREST`` instructions of the pool
             that differ from the given one in the fewest words, instead of among all.
@@ -62,7 +61,7 @@ class NegativeInstructions(nn.Module):
     def __init__(
         self,
         pool: Tensor,
-        removal_rate: float | str,
+        removal_rate: float | None,
         warmup: float = 1 / 3,
         generator: torch.Generator | None = None,
         near: float = 0.0,
@@ -73,18 +72,17 @@ class NegativeInstructions(nn.Module):
         if not isinstance(pool, Tensor) or pool.ndim != 2 or pool.dtype.is_floating_point:
             found = (pool.dtype, [*pool.shape]) if isinstance(pool, Tensor) else type(pool).__name__
             raise UserError(f"pool must be token ids [P, L], such as demos.pool(), got {found}")
-        estimated = removal_rate == ESTIMATED
-        if not estimated and (isinstance(removal_rate, str) or not 0 <= removal_rate < 1):
+        if removal_rate is not None and not 0 <= removal_rate < 1:
             raise UserError(
-                f"removal_rate must lie in [0, 1) or be 'estimated', got {removal_rate}"
+                f"removal_rate must lie in [0, 1), or be None to estimate it, got {removal_rate}"
             )
         distinct = torch.unique(pool, dim=0)
         if len(distinct) < 2:
             raise UserError("pool holds fewer than two different instructions: no negatives exist")
         self.register_buffer("pool", distinct, persistent=False)
         self.register_buffer("bound", torch.ones(()))
-        self.given = 0.0 if estimated else float(removal_rate)
-        self.estimate = MixtureEstimate() if estimated else None
+        self.given = removal_rate or 0.0
+        self.estimate = MixtureEstimate() if removal_rate is None else None
         self.warmup, self.near = warmup, near
         self.generator = generator
         self.progress = 1.0
@@ -178,7 +176,7 @@ class NegativeInstructions(nn.Module):
             UserError: where it is not estimated.
         """
         if self.estimate is None:
-            raise UserError("the share of suitable pairs needs removal_rate='estimated'")
+            raise UserError("the share of suitable pairs needs removal_rate=None")
         bound = float(self.bound) or 1.0  # none are dropped, and the estimate is free to move
         return min(self.estimate.share(), MOST_REMOVED, bound)
 
@@ -219,7 +217,8 @@ def pair_scores(
 
     A network with ``encode_scenes``, ``encode_instruction`` and ``score_candidates`` encodes each
     row's images and each distinct instruction once; any other runs once per pair. On a GPU every
-    instruction is encoded where scenes share nothing either: to find the distinct ones is to wait.
+    instruction is encoded where scenes share nothing either: finding the distinct ones would wait
+    for it.
 
     Args:
         network: images and an instruction, its last input, to a logit [*B, 1].

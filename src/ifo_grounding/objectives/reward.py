@@ -72,13 +72,8 @@ class RewardLoss(SupervisedLoss):
             raise UserError("a single action has no different ones to serve as negatives")
         self.generator = generator
 
-    @property
-    def capturable(self) -> bool:
-        """Whether all steps do the same: where words are charged for, they are looked at."""
-        return self._steps_alike()
-
     def _own_keys(self) -> list[NestedKey]:
-        """The network's inputs but for the action, which is the labelled one or another."""
+        # The last input is an action, the labelled one or another.
         return list(self.network.in_keys)[:-1]
 
     @dispatch

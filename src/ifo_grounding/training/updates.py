@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from ifo_grounding.networks.transfer import inherited
+from ifo_grounding.networks.warm_start import inherited
 
 
 def make_optimizer(

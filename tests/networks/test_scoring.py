@@ -1,14 +1,19 @@
-"""The halves of the instruction classifier and the goal judge; the reward model's actions."""
+"""The halves of the classifiers of pairs; the reward model's actions."""
 
 import pytest
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import make_goal_judge, make_instruction_classifier, make_reward_model
+from ifo_grounding.networks import (
+    make_goal_classifier,
+    make_instruction_classifier,
+    make_reward_model,
+    scoring,
+)
 from networks.conftest import inputs
 
 
-@pytest.fixture(params=[make_instruction_classifier, make_goal_judge])
+@pytest.fixture(params=[make_instruction_classifier, make_goal_classifier])
 def scorer(request, shapes, preset):
     return request.param(shapes, preset, seed=0)
 
@@ -17,46 +22,37 @@ def images(scorer, data):
     return [data[key] for key in scorer.in_keys[:-1]]
 
 
-def test_the_halves_together_are_the_whole(scorer, shapes):
-    data = inputs(shapes, [5])
-    halves = scorer.score(
-        scorer.encode_pixels(*images(scorer, data)), scorer.encode_instruction(data["instruction"])
-    )
-    out = scorer(data.select(*scorer.in_keys))[scorer.out_keys[0]]
-    torch.testing.assert_close(halves, out)
-
-
-@pytest.mark.parametrize("chunk", [1, 4, 2048])
-def test_every_scene_with_every_instruction(scorer, shapes, chunk):
+@pytest.mark.parametrize("at_once", [1, 4096])
+@pytest.mark.parametrize("encode", ["encode_scenes", "encode_pixels"])
+def test_the_halves_together_are_the_whole(scorer, shapes, at_once, encode, monkeypatch):
+    monkeypatch.setattr(scoring, "PAIRS_AT_ONCE", at_once)
     scenes, pool = inputs(shapes, [4]), inputs(shapes, [3], seed=1)["instruction"]
-    features = scorer.encode_pixels(*images(scorer, scenes))
-    scores = scorer.score_all(features, scorer.encode_instruction(pool), chunk=chunk)
-    expected = torch.cat(
-        [
-            scorer(scenes.select(*scorer.in_keys[:-1]).set("instruction", words.expand(4, -1)))[
-                scorer.out_keys[0]
-            ]
-            for words in pool
-        ],
-        -1,
-    )
-    torch.testing.assert_close(scores, expected)
+    encoded = getattr(scorer, encode)(*images(scorer, scenes))
+    every = torch.arange(3).expand(4, -1)
+    scores = scorer.score_candidates(encoded, scorer.encode_instruction(pool), every)
+    expected = [
+        scorer(scenes.select(*scorer.in_keys[:-1]).set("instruction", words.expand(4, -1)))[
+            scorer.out_keys[0]
+        ]
+        for words in pool
+    ]
+    torch.testing.assert_close(scores, torch.cat(expected, -1))
 
 
-def test_no_scenes_or_no_instructions_give_no_scores(scorer, shapes):
+def test_no_scenes_or_no_candidates_give_no_scores(scorer, shapes):
     data = inputs(shapes, [4])
-    features = scorer.encode_pixels(*images(scorer, data))
+    scenes = scorer.encode_scenes(*images(scorer, data))
     words = scorer.encode_instruction(data["instruction"])
-    assert scorer.score_all(features[:0], words).shape == (0, 4)
-    assert scorer.score_all(features, words[:0]).shape == (4, 0)
+    none = torch.zeros(4, 0, dtype=torch.int64)
+    assert scorer.score_candidates(scenes[:0], words, none[:0]).shape == (0, 0)
+    assert scorer.score_candidates(scenes, words, none).shape == (4, 0)
 
 
-def test_features_know_no_instruction_and_need_matching_batches(scorer, shapes):
+def test_features_keep_the_batch_and_inputs_need_the_same(scorer, shapes):
     data = inputs(shapes, [2, 3])
-    features = scorer.encode_pixels(*images(scorer, data))
-    assert features.shape[:2] == (2, 3)
+    assert scorer.encode_pixels(*images(scorer, data)).shape[:2] == (2, 3)
     with pytest.raises(UserError, match="same batch dims"):
-        scorer.score(features, scorer.encode_instruction(data["instruction"][0]))
+        scorer.module(*images(scorer, data), data["instruction"][0])
 
 
 def test_the_reward_model_scores_all_actions_as_it_scores_each(shapes, preset):

@@ -16,7 +16,7 @@ CONTRAST = 8.0
 """How sharply an edge is seen: neighbours that differ by 0.1 of the range of a pixel count 0.7."""
 
 
-class Looks(NamedTuple):
+class Appearance(NamedTuple):
     """What distinct cells look like."""
 
     colour: Tensor
@@ -35,8 +35,8 @@ class ColourAndForm(nn.Module):
     Colours are what a small network finds at any pixel, form is where neighbouring pixels differ.
     The first cannot tell a circle from a square, the second red from blue.
 
-    >>> looks = ColourAndForm(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48))
-    >>> looks.colour.shape, looks.silhouette.shape, looks.where.shape
+    >>> seen = ColourAndForm(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48))
+    >>> seen.colour.shape, seen.silhouette.shape, seen.where.shape
     (torch.Size([72, 16]), torch.Size([72, 64]), torch.Size([2, 36]))
     """
 
@@ -53,7 +53,7 @@ class ColourAndForm(nn.Module):
         self.form = nn.Linear(features, EVIDENCE)
         self.silhouette = nn.Linear(edges, features)
 
-    def forward(self, image: Tensor) -> Looks:
+    def forward(self, image: Tensor) -> Appearance:
         """See an image [N, C, H, W], its distinct cells once."""
         tiles, where = self.tiles(image)
         pixels = tiles.transpose(1, 2)  # [U, P * P, C]
@@ -61,7 +61,7 @@ class ColourAndForm(nn.Module):
         edges = self.edges(tiles)
         form = self.form(F.relu(self.outline(edges)))
         size = (EVIDENCE,)
-        return Looks(
+        return Appearance(
             F.layer_norm(colour, size),
             F.layer_norm(form, size),
             F.relu(self.silhouette(edges)),

@@ -1,0 +1,130 @@
+"""Initial weights that another network has learned (``init_from``)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks.grounding import MEANING, GroundedTrunk
+from ifo_grounding.networks.scoring import GatedScorer, PairScorer
+from ifo_grounding.networks.trunk import GatedTrunk, InstructedNetwork
+from ifo_grounding.networks.word_scoring import WordScorer
+
+Parts = list[tuple[nn.Module, nn.Module]]
+
+
+def trunk_of(policy: nn.Module) -> GatedTrunk | GroundedTrunk:
+    """Return the trunk of a policy that ``make_policy`` built.
+
+    >>> from ifo_grounding.networks import Shapes, make_policy
+    >>> trunk_of(make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))).size
+    312
+    """
+    return instructed_network(policy).trunk
+
+
+def instructed_network(policy: nn.Module) -> InstructedNetwork:
+    """Return the network within a policy that ``make_policy`` built."""
+    found = [part for part in policy.modules() if isinstance(part, InstructedNetwork)]
+    if len(found) != 1:
+        raise UserError("this must be a policy built by make_policy")
+    return found[0]
+
+
+def start_trunk(network: InstructedNetwork, policy: nn.Module) -> None:
+    """Copy the weights of a policy's trunk to a critic or a reward model.
+
+    Raises:
+        UserError: where the weights do not fit.
+    """
+    source = instructed_network(policy)
+    _copy(source, network, [(source.trunk, network.trunk)])
+
+
+def start_scorer(network: PairScorer, policy: nn.Module, roles: bool = False) -> None:
+    """Copy what a policy has learned of words, cells and places; of several images, to the last.
+
+    Of words that are read one by one that is what they look like and which side they name. Which
+    of them count for which map is learned anew, unless ``roles`` says otherwise: a policy may hear
+    object and target in one map, one after the other, which tells nobody whether both are there.
+
+    Raises:
+        UserError: where the weights do not fit.
+    """
+    source = instructed_network(policy)
+    trunk = source.trunk
+    parts: Parts = []
+    widened: Parts = []
+    if isinstance(trunk, GroundedTrunk) and isinstance(network, WordScorer):
+        parts = [(trunk.appearance, network.appearance)]
+        if roles:
+            parts += [(trunk.words, network.words)]
+        else:
+            words = trunk.words, network.words
+            parts += [(getattr(words[0], name), getattr(words[1], name)) for name in MEANING]
+        widened = [(trunk.attention, network.attention), (trunk.value, network.value)]
+    elif isinstance(trunk, GatedTrunk) and isinstance(network, GatedScorer):
+        own = network.trunk
+        parts = [(trunk.instruction, own.instruction), (trunk.fusion, own.fusion)]
+        widened = [(trunk.image, own.image)]
+    _copy(source, network, parts, widened)
+
+
+def _copy(
+    source: InstructedNetwork,
+    network: InstructedNetwork | PairScorer,
+    parts: Parts,
+    widened: Parts | tuple[()] = (),
+) -> None:
+    """Copy the weights of each pair's first module to its second, which remembers them.
+
+    Args:
+        source: the network of the first modules.
+        network: that of the second.
+        parts: modules of the same kind and sizes.
+        widened: modules of which the second may read more images than one, whose inputs lie one
+            after the other: it reads the last one as the first module does, the others not yet.
+    """
+    try:
+        if source.config.preset != network.config.preset:
+            raise RuntimeError
+        for given, taken in parts:
+            taken.load_state_dict(given.state_dict())
+        for given, taken in widened:
+            own, theirs = taken.state_dict(), given.state_dict()
+            fitted = {name: _last(weight, own[name]) for name, weight in theirs.items()}
+            taken.load_state_dict(fitted)
+    except RuntimeError:
+        raise UserError(
+            f"init_from does not fit: it is {source.config} for {source.shapes}, this is "
+            f"{network.config} for {network.shapes}; give both the same preset, sizes and options"
+        ) from None
+    for _, taken in [*parts, *widened]:
+        copied = {name: weight.detach().clone() for name, weight in taken.named_parameters()}
+        taken.inherited = copied
+
+
+def inherited(module: nn.Module) -> list[tuple[nn.Parameter, Tensor]]:
+    """Return the parameters of a module that were another network's, with what they were then.
+
+    >>> from ifo_grounding.networks import Shapes, make_goal_classifier, make_policy
+    >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
+    >>> classifier = make_goal_classifier(shapes, init_from=make_policy(shapes, seed=0))
+    >>> all(torch.equal(now, then) for now, then in inherited(classifier))
+    True
+    """
+    found = []
+    for part in module.modules():
+        for name, then in getattr(part, "inherited", {}).items():
+            weight = part.get_parameter(name)
+            found.append((weight, then.to(weight.device)))
+    return found
+
+
+def _last(weight: Tensor, like: Tensor) -> Tensor:
+    """Return a weight as the last inputs of a larger one, whose first ones count nothing."""
+    more = like.shape[1] - weight.shape[1] if like.ndim > 1 else 0
+    if more <= 0:
+        return weight
+    return torch.cat([weight.new_zeros(len(weight), more, *weight.shape[2:]), weight], 1)

@@ -1,0 +1,84 @@
+"""Networks whose initial weights are a policy's."""
+
+import pytest
+import torch
+from torch import nn
+
+from ifo_grounding.errors import UserError
+from ifo_grounding.networks import (
+    make_goal_classifier,
+    make_instruction_classifier,
+    make_inverse,
+    make_policy,
+    make_reward_model,
+    make_value,
+)
+from ifo_grounding.networks.warm_start import inherited, trunk_of
+
+SCORERS = [make_instruction_classifier, make_goal_classifier]
+EVERY = [make_value, make_reward_model, *SCORERS]
+
+
+@pytest.mark.parametrize("make", [make_value, make_reward_model])
+def test_a_trunk_is_copied_and_goes_its_own_way(shapes, preset, make):
+    policy = make_policy(shapes, preset, seed=0)
+    network = make(shapes, preset, init_from=policy, seed=1)
+    source, target = trunk_of(policy), network.module.trunk
+    assert all(map(torch.equal, source.state_dict().values(), target.state_dict().values()))
+    assert all(torch.equal(now, then) for now, then in inherited(network))
+    with torch.no_grad():
+        next(target.parameters()).add_(1)
+    assert not torch.equal(next(source.parameters()), next(target.parameters()))
+
+
+@pytest.mark.parametrize("make", EVERY)
+def test_what_does_not_fit_is_refused(shapes, make):
+    for options in ({"preset": "paper"}, {"features": 32}):
+        with pytest.raises(UserError, match=r"init_from does not fit.*same preset, sizes"):
+            make(shapes, init_from=make_policy(shapes, **options))
+    for other in (make_inverse(shapes), nn.Linear(1, 1)):
+        with pytest.raises(UserError, match="must be a policy"):
+            make(shapes, init_from=other)
+
+
+@pytest.mark.parametrize("make", SCORERS)
+def test_a_classifier_of_paper_copies_sentences_gates_and_the_last_image(shapes, make):
+    policy = make_policy(shapes, "paper", seed=0)
+    classifier = make(shapes, "paper", init_from=policy, seed=1)
+    tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
+    trunk, own = trunk_of(policy), classifier.module.trunk
+    assert torch.equal(classifier.encode_instruction(tokens), trunk.instruction(tokens))
+    assert torch.equal(own.fusion.h.weight, trunk.fusion.h.weight)
+    first, other, now = torch.randint(256, (3, 5, *shapes.image_shape), dtype=torch.uint8)
+    features = classifier.encode_pixels(*(first, now)[-classifier.images :])
+    assert torch.equal(features, classifier.encode_pixels(*(other, now)[-classifier.images :]))
+    torch.testing.assert_close(features, trunk.image(now))
+
+
+@pytest.mark.parametrize("make", SCORERS)
+def test_a_classifier_of_strong_copies_what_words_mean_and_the_last_image(shapes, make):
+    policy = make_policy(shapes, seed=0)
+    classifier = make(shapes, init_from=policy, seed=1)
+    tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
+    trunk = trunk_of(policy)
+    start, now = torch.randint(256, (2, 5, *shapes.image_shape), dtype=torch.uint8)
+    features = classifier.encode_pixels(*(start, now)[-classifier.images :])
+    words_said = classifier.images * shapes.vocabulary_size
+    heads = trunk.attention.out_features + trunk.value.out_features
+    silent = features.flatten(2)[:, words_said : words_said + heads]
+    cells = trunk.appearance(now)
+    expected = torch.cat([trunk.attention(cells.silhouette), trunk.value(cells.silhouette)], -1)
+    torch.testing.assert_close(silent.transpose(1, 2), expected[cells.where])
+    (_, modifier), words = trunk.words.listen(tokens), classifier.encode_instruction(tokens)
+    torch.testing.assert_close(words[:, -modifier.shape[1] :], modifier)
+    # Which words count for which map is its own to learn.
+    fresh = make(shapes, seed=1).encode_instruction(tokens)
+    own = words[:, : -modifier.shape[1]]
+    torch.testing.assert_close(own, fresh[:, : own.shape[1]])
+
+
+def test_roles_of_words_are_copied_where_asked(shapes):
+    policy = make_policy(shapes, seed=0)
+    classifier = make_instruction_classifier(shapes, init_from=policy, roles=True, seed=1)
+    own, theirs = classifier.module.words.state_dict(), trunk_of(policy).words.state_dict()
+    assert all(torch.equal(own[name], weight) for name, weight in theirs.items())
