@@ -23,11 +23,10 @@ def images(scorer, data):
 
 
 @pytest.mark.parametrize("at_once", [1, 4096])
-@pytest.mark.parametrize("encode", ["encode_scenes", "encode_pixels"])
-def test_the_halves_together_are_the_whole(scorer, shapes, at_once, encode, monkeypatch):
+def test_the_halves_together_are_the_whole(scorer, shapes, at_once, monkeypatch):
     monkeypatch.setattr(scoring, "PAIRS_AT_ONCE", at_once)
     scenes, pool = inputs(shapes, [4]), inputs(shapes, [3], seed=1)["instruction"]
-    encoded = getattr(scorer, encode)(*images(scorer, scenes))
+    encoded = scorer.encode_scenes(*images(scorer, scenes))
     every = torch.arange(3).expand(4, -1)
     scores = scorer.score_candidates(encoded, scorer.encode_instruction(pool), every)
     expected = [
@@ -48,9 +47,8 @@ def test_no_scenes_or_no_candidates_give_no_scores(scorer, shapes):
     assert scorer.score_candidates(scenes, words, none).shape == (4, 0)
 
 
-def test_features_keep_the_batch_and_inputs_need_the_same(scorer, shapes):
+def test_inputs_need_the_same_batch(scorer, shapes):
     data = inputs(shapes, [2, 3])
-    assert scorer.encode_pixels(*images(scorer, data)).shape[:2] == (2, 3)
     with pytest.raises(UserError, match="same batch dims"):
         scorer.module(*images(scorer, data), data["instruction"][0])
 

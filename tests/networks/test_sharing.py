@@ -143,10 +143,10 @@ def test_what_cannot_be_shared_or_found_is_said(tmp_path, monkeypatch):
 def test_the_hub_gets_the_folder_in_one_commit(tmp_path, monkeypatch):
     sent = {}
 
-    def upload(api, **options):
-        folder = Path(options["folder_path"])
-        files = {path.name: path.read_bytes() for path in folder.iterdir()}
-        sent.update(options, files=files)
+    def upload(api, *, folder_path, repo_id, allow_patterns, delete_patterns, commit_message=""):
+        files = {path.name: path.read_bytes() for path in Path(folder_path).iterdir()}
+        assert set(allow_patterns) >= set(files) and delete_patterns == ["vocabulary.json"]
+        sent.update(repo_id=repo_id, commit_message=commit_message, files=files)
         return "https://a.commit"
 
     def create(api, repo_id, **options):
@@ -167,7 +167,6 @@ def test_the_hub_gets_the_folder_in_one_commit(tmp_path, monkeypatch):
     assert sent["files"] == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert sent["repo_id"] == "a/policy" and sent["commit_message"] == "first"
     assert sent["created"] == {"private": True, "exist_ok": True}
-    assert set(sent["allow_patterns"]) == set(sent["files"])
     policy.push_to_hub("a/other", facts={"Task": "move"})
     assert sent["repo_id"] == "a/other" and b"| Task | move |" in sent["files"]["README.md"]
     with pytest.raises(TypeError, match="privat"):

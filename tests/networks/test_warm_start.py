@@ -12,6 +12,7 @@ from ifo_grounding.networks import (
     make_policy,
     make_reward_model,
     make_value,
+    word_scoring,
 )
 from ifo_grounding.networks.warm_start import inherited, trunk_of
 
@@ -50,22 +51,23 @@ def test_a_classifier_of_paper_copies_sentences_gates_and_the_last_image(shapes,
     assert torch.equal(classifier.encode_instruction(tokens), trunk.instruction(tokens))
     assert torch.equal(own.fusion.h.weight, trunk.fusion.h.weight)
     first, other, now = torch.randint(256, (3, 5, *shapes.image_shape), dtype=torch.uint8)
-    features = classifier.encode_pixels(*(first, now)[-classifier.images :])
-    assert torch.equal(features, classifier.encode_pixels(*(other, now)[-classifier.images :]))
+    features = classifier.encode_scenes(*(first, now)[-classifier.images :])
+    assert torch.equal(features, classifier.encode_scenes(*(other, now)[-classifier.images :]))
     torch.testing.assert_close(features, trunk.image(now))
 
 
 @pytest.mark.parametrize("make", SCORERS)
-def test_a_classifier_of_strong_copies_what_words_mean_and_the_last_image(shapes, make):
+def test_a_classifier_of_strong_copies_what_words_mean(shapes, make, monkeypatch):
+    monkeypatch.setattr(word_scoring, "hidden_from_python", lambda tensor: True)  # cell by cell
     policy = make_policy(shapes, seed=0)
     classifier = make(shapes, init_from=policy, seed=1)
     tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
     trunk = trunk_of(policy)
     start, now = torch.randint(256, (2, 5, *shapes.image_shape), dtype=torch.uint8)
-    features = classifier.encode_pixels(*(start, now)[-classifier.images :])
+    features = classifier.encode_scenes(*(start, now)[-classifier.images :]).features
     words_said = classifier.images * shapes.vocabulary_size
     heads = trunk.attention.out_features + trunk.value.out_features
-    silent = features.flatten(2)[:, words_said : words_said + heads]
+    silent = features[:, words_said : words_said + heads]
     cells = trunk.appearance(now)
     expected = torch.cat([trunk.attention(cells.silhouette), trunk.value(cells.silhouette)], -1)
     torch.testing.assert_close(silent.transpose(1, 2), expected[cells.where])

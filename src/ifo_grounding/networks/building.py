@@ -65,14 +65,23 @@ class NetworkModule(Shareable, TensorDictModule):
     """A network with names for what it reads and writes."""
 
 
+INPUTS = {
+    "inverse": ("image", "next image"),
+    "policy": ("image", "instruction"),
+    "value": ("image", "instruction"),
+    "instruction": ("image", "instruction"),
+    "reward": ("image", "instruction", "action"),
+    "goal": ("first image", "image", "instruction"),
+}
+"""What each kind of network reads, in the order of its ``in_keys``."""
+
+
 def build(
     kind: str,
     network: Callable[[Shapes, NetworkConfig], nn.Module],
     source: Any,
     preset: str,
-    inputs: Sequence[str],
     options: dict[str, Any],
-    *,
     device: torch.device | str | None,
     seed: int | None,
     overrides: dict[str, Any],
@@ -87,7 +96,6 @@ def build(
         network: its class, or a function that builds it.
         source: what sizes are read from, see :meth:`Shapes.of`.
         preset: ``"strong"`` or ``"paper"``.
-        inputs: what each of ``in_keys`` is, for the error.
         options: the keyword arguments of the ``make_*`` function that are not named here.
         device: where to build it.
         seed: makes the initial weights a function of the seed alone.
@@ -95,6 +103,7 @@ def build(
         wrap: makes what is returned of the network; by default a TensorDictModule.
     """
     in_keys: Sequence[NestedKey] = options["in_keys"]
+    inputs = INPUTS[kind]
     if isinstance(in_keys, str) or len(in_keys) != len(inputs):
         raise UserError(
             f"in_keys must be {len(inputs)} keys ({', '.join(inputs)}), got {in_keys!r}"

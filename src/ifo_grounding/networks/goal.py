@@ -57,17 +57,9 @@ def make_goal_classifier(
     >>> classifier(initial_pixels=frame, pixels=frame, instruction=torch.ones(2, 16)).shape
     torch.Size([2, 1])
     """
-    classifier: TensorDictModule = build(
-        "goal",
-        partial(pair_scorer, images=2),
-        spec_source,
-        preset,
-        ("first image", "image", "instruction"),
-        {"in_keys": in_keys, "out_key": out_key},
-        device=device,
-        seed=seed,
-        overrides=overrides,
-    )
+    options = {"in_keys": in_keys, "out_key": out_key}
+    scorer = partial(pair_scorer, images=2)
+    classifier = build("goal", scorer, spec_source, preset, options, device, seed, overrides)
     if init_from is not None:
         start_scorer(classifier.module, init_from)
     return classifier

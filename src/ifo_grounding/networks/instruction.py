@@ -69,16 +69,9 @@ def make_instruction_classifier(
     >>> classifier.score_candidates(scenes, pool, candidates).shape
     torch.Size([5, 2])
     """
-    classifier: TensorDictModule = build(
-        "instruction",
-        pair_scorer,
-        spec_source,
-        preset,
-        ("image", "instruction"),
-        {"in_keys": in_keys, "out_key": out_key},
-        device=device,
-        seed=seed,
-        overrides=overrides,
+    options = {"in_keys": in_keys, "out_key": out_key}
+    classifier = build(
+        "instruction", pair_scorer, spec_source, preset, options, device, seed, overrides
     )
     if init_from is not None:
         start_scorer(classifier.module, init_from, roles)

@@ -120,14 +120,5 @@ def make_inverse(
     >>> inverse(pixels=frame, next_pixels=frame).shape
     torch.Size([2, 6])
     """
-    return build(
-        "inverse",
-        InverseNetwork,
-        spec_source,
-        preset,
-        ("image", "next image"),
-        {"in_keys": in_keys, "out_key": out_key},
-        device=device,
-        seed=seed,
-        overrides=overrides,
-    )
+    options = {"in_keys": in_keys, "out_key": out_key}
+    return build("inverse", InverseNetwork, spec_source, preset, options, device, seed, overrides)

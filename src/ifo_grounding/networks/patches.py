@@ -31,8 +31,8 @@ def remembered(
 ) -> Callable[[Tensor, int], Found | None]:
     """Keep what was found in the last images, for whoever asks about the same ones next.
 
-    Actor and critic, or policy and judge, look at the same images one after the other. To keep a
-    copy of these and to compare all bytes takes a twentieth of the time of finding what repeats.
+    Actor and critic, or policy and reward model, read the same images one after the other. To keep
+    a copy of these and to compare all bytes takes a twentieth of the time of finding what repeats.
     """
     last: tuple[Tensor, tuple[int, torch.Size], Found] | None = None
 

@@ -100,18 +100,14 @@ def make_policy(
             default_interaction_type=kind,
         )
 
-    keywords = {"action_key": action_key, "logits_key": logits_key, "deterministic": deterministic}
+    options = {
+        "in_keys": in_keys,
+        "action_key": action_key,
+        "logits_key": logits_key,
+        "deterministic": deterministic,
+    }
     return build(
-        "policy",
-        PolicyNetwork,
-        spec_source,
-        preset,
-        ("image", "instruction"),
-        {"in_keys": in_keys, **keywords},
-        device=device,
-        seed=seed,
-        overrides=overrides,
-        wrap=actor,
+        "policy", PolicyNetwork, spec_source, preset, options, device, seed, overrides, actor
     )
 
 
@@ -148,17 +144,13 @@ def make_value(
     >>> value(pixels=torch.zeros(2, 3, 48, 48), instruction=torch.ones(2, 16)).shape
     torch.Size([2, 1])
     """
+    options = {"in_keys": in_keys, "out_key": out_key}
+
+    def critic(network: nn.Module, plan: Blueprint) -> Value:
+        return Value(network, plan.options["in_keys"], [out_key])
+
     value = build(
-        "value",
-        ValueNetwork,
-        spec_source,
-        preset,
-        ("image", "instruction"),
-        {"in_keys": in_keys, "out_key": out_key},
-        device=device,
-        seed=seed,
-        overrides=overrides,
-        wrap=lambda network, plan: Value(network, plan.options["in_keys"], [out_key]),
+        "value", ValueNetwork, spec_source, preset, options, device, seed, overrides, critic
     )
     if init_from is not None:
         start_trunk(value.module, init_from)

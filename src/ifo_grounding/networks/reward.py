@@ -73,17 +73,8 @@ def make_reward_model(
     >>> rwd(pixels=image, instruction=words, action=torch.tensor([0, 5])).shape
     torch.Size([2, 1])
     """
-    model: TensorDictModule = build(
-        "reward",
-        RewardNetwork,
-        spec_source,
-        preset,
-        ("image", "instruction", "action"),
-        {"in_keys": in_keys, "out_key": out_key},
-        device=device,
-        seed=seed,
-        overrides=overrides,
-    )
+    options = {"in_keys": in_keys, "out_key": out_key}
+    model = build("reward", RewardNetwork, spec_source, preset, options, device, seed, overrides)
     if init_from is not None:
         start_trunk(model.module, init_from)
     return model

@@ -85,40 +85,25 @@ class PairScorer(ImageNetwork):
         scores = scores + self.prior
         return scores - self.mixed * torch.log1p(-scores.clamp(max=math.log(SUREST)).exp())
 
-    def encode_pixels(self, *pixels: Tensor) -> Tensor:
-        """Map images, each [*B, C, H, W], to features [*B, F, h, w] that know no instruction."""
-        images, batch = self.flat_images(*pixels)
-        with self.autocast(pixels[0]):
-            features = self._features(images)
-        return features.reshape(*batch, *features.shape[1:])
-
     def flat_images(self, *pixels: Tensor) -> tuple[list[Tensor], torch.Size]:
         """Return images, each [*B, C, H, W], as [N, C, H, W], and the B that they share."""
         flat = [self.flat_pixels(image) for image in pixels]
         same_batch(**{f"image {number}": batch for number, (_, batch) in enumerate(flat)})
         return [image for image, _ in flat], flat[0][1]
 
-    def _features(self, images: list[Tensor]) -> Tensor:
-        """Map images, each [N, C, H, W], to features [N, F, h, w]."""
+    def encode_scenes(self, *pixels: Tensor) -> Any:
+        """Encode images, each [N, C, H, W], for :meth:`score_candidates`."""
         raise NotImplementedError
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
-        """Map token ids [*B, L] to features [*B, D]."""
+        """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
         raise NotImplementedError
-
-    def encode_scenes(self, *pixels: Tensor) -> Any:
-        """Encode images, each [N, C, H, W], for :meth:`score_candidates`.
-
-        Returns:
-            Features [N, F, h, w], or what stands for them where cells repeat.
-        """
-        return self.encode_pixels(*pixels)
 
     def score_candidates(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor:
         """Score some instructions of a pool for each scene.
 
         Args:
-            scenes: N encoded scenes, from :meth:`encode_scenes` or :meth:`encode_pixels`.
+            scenes: N encoded scenes, from :meth:`encode_scenes`.
             words: encoded instructions [P, D], from :meth:`encode_instruction`.
             index: candidates of each scene, int64 [N, K].
 
@@ -159,12 +144,14 @@ class GatedScorer(PairScorer):
         self.trunk = GatedTrunk(shapes, config, images)
         self.head = head(self.trunk.size, config, 1)
 
-    def _features(self, images: list[Tensor]) -> Tensor:
-        features: Tensor = self.trunk.image(torch.cat(images, -3))
+    def encode_scenes(self, *pixels: Tensor) -> Tensor:
+        """Map images, each [N, C, H, W], to features [N, F, h, w]."""
+        images, _ = self.flat_images(*pixels)
+        with self.autocast(pixels[0]):
+            features: Tensor = self.trunk.image(torch.cat(images, -3))
         return features
 
-    def encode_instruction(self, instruction: Tensor) -> Tensor:
-        """Map token ids [*B, L] to features [*B, D]; each distinct instruction is encoded once."""
+    def encode_instruction(self, instruction: Tensor) -> Tensor:  # noqa: D102
         encoded: Tensor = self.trunk.instruction(instruction)
         return encoded
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -52,8 +51,8 @@ def save_pretrained(
             :func:`from_pretrained` gives them back.
         facts: what the card says, such as ``{"Task": "move", "Success": "99.7% [99.5, 99.8]"}``.
         hub_id: ``user/name`` on the Hub; needs the extra ``hub`` and an account that is logged in.
-        hub: for ``push_to_hub`` of ``huggingface_hub.ModelHubMixin``, such as ``private``,
-            ``commit_message``, ``branch``, ``create_pr`` or ``token``.
+        hub: ``private``, ``token``, and options of ``huggingface_hub.HfApi.upload_folder`` such as
+            ``commit_message``, ``revision`` or ``create_pr``.
 
     Returns:
         The folder.
@@ -93,7 +92,7 @@ def save_pretrained(
             temporary.write_text(_card(plan, facts or {}), encoding="utf-8")
     save(module, folder / WEIGHTS)
     if hub_id is not None:
-        _upload(folder, hub_id, hub)
+        _upload(folder, hub_id, **hub)
     return folder
 
 
@@ -132,11 +131,17 @@ def from_pretrained(
     return module
 
 
-def _upload(folder: Path, hub_id: str, options: dict[str, Any]) -> None:
+def _upload(folder: Path, hub_id: str, private: bool | None = None, **options: Any) -> None:
     """Send the files of a network in one commit; those of another that was there go with it."""
+    api = _hub().HfApi(token=options.pop("token", None))
     try:
-        _mixin()(folder).push_to_hub(
-            hub_id, allow_patterns=FILES, delete_patterns=[WORDS], **options
+        repo = api.create_repo(hub_id, private=private, exist_ok=True)
+        api.upload_folder(
+            repo_id=repo.repo_id,
+            folder_path=folder,
+            allow_patterns=FILES,
+            delete_patterns=[WORDS],
+            **options,
         )
     except TypeError:  # an option that there is not
         raise
@@ -145,22 +150,6 @@ def _upload(folder: Path, hub_id: str, options: dict[str, Any]) -> None:
             f"{hub_id} could not be sent to the Hugging Face Hub ({_first_line(error)}): mend the "
             "name or the connection, or log in with `hf auth login`"
         ) from None
-
-
-def _mixin() -> Any:
-    """Return the Hub's mixin for a folder that is written already."""
-    mixin: Any = _hub().ModelHubMixin
-
-    class Shared(mixin):
-        def __init__(self, folder: Path) -> None:
-            self.folder = folder
-
-        def _save_pretrained(self, save_directory: Path) -> None:
-            for name in FILES:
-                if (self.folder / name).exists():
-                    shutil.copy(self.folder / name, save_directory / name)
-
-    return Shared
 
 
 def _first_line(error: Exception) -> str:

@@ -74,13 +74,6 @@ class WordScorer(PairScorer):
         seen = config.heads * (2 + config.values + 2 * maps)
         self.head = head(seen + 2 * maps * (3 + AROUND) + 2 * maps + MODIFIER, config, 1)
 
-    def _features(self, images: list[Tensor]) -> Tensor:
-        """Map images [N, C, H, W] to features [N, images * V + heads + values + AROUND, h, w]."""
-        tables = self._tables(images)
-        seen = self._seen(tables, [table.where for table in tables])
-        features = torch.cat([seen, self._surroundings(tables)], -1)
-        return features.movedim(1, -1).unflatten(-1, self.grid)
-
     def _tables(self, images: list[Tensor]) -> list[Seen]:
         """See the distinct cells of each image."""
         heads = (self.attention, self.value, self.form)
@@ -106,18 +99,20 @@ class WordScorer(PairScorer):
         forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
         return F.relu(surroundings(self.around, F.relu(forms), self.grid))
 
-    def encode_scenes(self, *pixels: Tensor) -> Kinds | Tensor:
+    def encode_scenes(self, *pixels: Tensor) -> Kinds:
         """Encode images, each [N, C, H, W], those of their cells that look alike once."""
-        if hidden_from_python(pixels[0]):
-            return self.encode_pixels(*pixels)
         images, _ = self.flat_images(*pixels)
         with self.autocast(pixels[0]):
             tables = self._tables(images)
             around = self._surroundings(tables)
+            place = self.place.to(around.dtype).expand(len(around), -1, -1)
+            if hidden_from_python(pixels[0]):  # every cell for itself
+                seen = self._seen(tables, [table.where for table in tables])
+                ones = around.new_ones(around.shape[:2])
+                return Kinds(torch.cat([seen, around], -1).transpose(1, 2), place, ones)
             index = tables[0].where
             for table in tables[1:]:
                 index = index * len(table.said) + table.where
-            place = self.place.to(around.dtype).expand(len(around), -1, -1)
             kind, number, mean = group_cells(index, torch.cat([place, around], -1))
             cells: list[Tensor] = []
             for table in reversed(tables):
@@ -139,13 +134,9 @@ class WordScorer(PairScorer):
         words = words if which is None else look_up(words, which)
         return words.reshape(*instruction.shape[:-1], words.shape[-1])
 
-    def _read(self, scenes: Kinds | Tensor, words: Tensor, index: Tensor) -> Tensor:
+    def _read(self, scenes: Kinds, words: Tensor, index: Tensor) -> Tensor:
         # Cells are the second dimension throughout: on a CPU a softmax over a last dimension of a
         # dozen takes thirty times as long.
-        if isinstance(scenes, Tensor):
-            every = scenes.flatten(2)
-            ones = every.new_ones(len(every), every.shape[-1])
-            scenes = Kinds(every, self.place.expand(len(every), -1, -1), ones)
         cells, place = scenes.features, scenes.place.to(scenes.features.dtype)
         number = scenes.number.to(cells.dtype)  # [N, C]
         each, prior = number.clamp_min(1), number.log()
