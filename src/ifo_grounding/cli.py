@@ -98,10 +98,11 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
             own = (conf / f"{script.stem}.yaml").exists()
 
             def job(cfg: DictConfig) -> None:
-                if asked:
-                    print(help_text(script.stem, cfg))
-                else:
-                    function(OmegaConf.to_object(cfg) if own else current(cfg))  # type: ignore[arg-type]
+                with one_line_errors():
+                    if asked:
+                        print(help_text(script.stem, cfg))
+                    else:
+                        function(OmegaConf.to_object(cfg) if own else current(cfg))
 
             run = hydra.main(
                 version_base=None,
