@@ -105,10 +105,10 @@ def typed(cfg: DictConfig) -> Options:
     options = {}
     for field in dataclasses.fields(Options):
         value = values[field.name]
-        kind = field.default_factory
+        kind: Any = field.default_factory
         if dataclasses.is_dataclass(kind):
             try:
-                value = kind(**value)
+                value = kind(**value)  # type: ignore[operator]
             except UserError as error:
                 raise UserError(_placed(str(error), field.name)) from None
         options[field.name] = value
@@ -147,7 +147,7 @@ def _refuse_unknown(cfg: DictConfig) -> None:
             raise UserError(f"unknown option {name!r}{did_you_mean(str(name), known)}")
         if name not in cfg:
             raise UserError(f"option {name!r} is needed: do not remove it")
-        kind = known[str(name)].default_factory
+        kind: Any = known[str(name)].default_factory
         if dataclasses.is_dataclass(kind):
             fields = {field.name for field in dataclasses.fields(kind)}
             for wrong in fields.symmetric_difference(map(str, cfg[name])):
@@ -177,7 +177,7 @@ def explained(error: Exception) -> UserError:
 
 def help_text(recipe: str, cfg: DictConfig) -> str:
     """Return all options with their values and what they mean, section by section."""
-    kind = OmegaConf.get_type(cfg)
+    kind: Any = OmegaConf.get_type(cfg)
     lines = [
         f"{recipe}: options are written name=value, those of a section section.name=value.",
         "",
@@ -185,7 +185,7 @@ def help_text(recipe: str, cfg: DictConfig) -> str:
     for group in ("preset", "budget", "world") if kind is Options else ():
         files = (recipes_folder() / "conf" / group).glob("*.yaml")
         lines.append(f"  {group}: {', '.join(sorted(path.stem for path in files))}")
-    return "\n".join([*lines, "", *described(kind, OmegaConf.to_container(cfg))])
+    return "\n".join([*lines, "", *described(kind, plain(cfg))])
 
 
 def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[str]:
