@@ -18,6 +18,7 @@ Written `name=value`, as [Recipes](recipes.md#options) shows. Values are those o
 `strong` / `paper` where these presets differ; `ifo-grounding demo budget=few --help` shows others.
 """
 SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
+WORLDS = {"world=grid": Grid, "world=babyai": BabyAI, "world=gymnasium": Gymnasium}
 FITTED = [name for name, kind in SECTIONS.items() if issubclass(kind, FitConfig)]
 
 
@@ -25,27 +26,20 @@ def page() -> str:
     """Return the page as Markdown."""
     composed = (options_of(f"preset={name}") for name in ("strong", "paper"))
     presets = [replace(each, run=Options.run) for each in composed]
+    values = {name: [getattr(each, name) for each in presets] for name in SECTIONS}
     general = [f.name for f in fields(Options) if f.name not in (*SECTIONS, "world")]
+    learning = [*field_docs(FitConfig)]
+    said = f"Each in {', '.join(f'`{name}`' for name in FITTED)}, such as `imitate.lr`."
     parts = [HEAD, "## General\n", table(Options, general, "", value=presets)]
-    said = ", ".join(f"`{name}`" for name in FITTED)
-    parts.append(f"## How networks learn\n\nEach in the sections {said}, such as `imitate.lr`.\n")
-    learning = {name: [getattr(each, name) for each in presets] for name in FITTED}
-    parts.append(table(FitConfig, [*field_docs(FitConfig)], "", **learning))
-    for name, kind in SECTIONS.items():
-        values = [getattr(each, name) for each in presets]
-        own = set(field_docs(kind)) - set(field_docs(FitConfig) if name in FITTED else ())
-        parts.append(part(name, kind, [each for each in field_docs(kind) if each in own], values))
-    for kind in (Grid, BabyAI, Gymnasium):
-        name = f"world={kind.__name__.lower()}"
-        values = [SimpleNamespace(**options_of(name).world)]
-        parts.append(part(name, kind, [*field_docs(kind)], values))
-    return "\n".join(filter(None, parts))
-
-
-def part(name: str, kind: type, names: list[str], values: list) -> str:
-    said = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("``", "`")
-    shown = table(kind, names, f"{name.partition('=')[0]}.", value=values)
-    return f"## {name}\n\n{said}\n\n{shown}" if names else ""
+    parts += [f"## How networks learn\n\n{said}\n"]
+    parts += [table(FitConfig, learning, "", **{name: values[name] for name in FITTED})]
+    for name, kind in {**SECTIONS, **WORLDS}.items():
+        shown = values.get(name) or [SimpleNamespace(**options_of(name).world)]
+        if own := [n for n in field_docs(kind) if name not in FITTED or n not in learning]:
+            said = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("``", "`")
+            parts += [f"## {name}\n\n{said}\n"]
+            parts += [table(kind, own, f"{name.partition('=')[0]}.", value=shown)]
+    return "\n".join(parts)
 
 
 def table(kind: type, names: list[str], above: str, **columns: list) -> str:
