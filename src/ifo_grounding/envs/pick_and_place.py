@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 from typing import Any
 
@@ -114,6 +115,15 @@ class PickAndPlaceEnv(EnvBase):
     def task(self) -> str:
         """Name of the task."""
         return self.options.task
+
+    @property
+    def stream(self) -> str:
+        """Name of the stream of scenes; another one that is set is gone to at the next seeding."""
+        return self.options.stream
+
+    @stream.setter
+    def stream(self, stream: str) -> None:
+        self.options = self._simulator.options = dataclasses.replace(self.options, stream=stream)
 
     @property
     def scene_numbers(self) -> Tensor:

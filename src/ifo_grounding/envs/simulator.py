@@ -108,7 +108,7 @@ class Simulator:
             scene = self.scene.to(self.device)
             self._episodes = _Episodes(scene.state, scene.wanted, scene.instruction)
         self._prepare()
-        self.stream = SceneStream(self.options, self.stream.seed, self.device)
+        self.stream = SceneStream(self.stream.options, self.stream.seed, self.device)
         return self
 
     @property

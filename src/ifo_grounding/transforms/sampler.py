@@ -13,7 +13,7 @@ from torch import Tensor
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.keys import INSTRUCTION, PIXELS
 from ifo_grounding.seeding import generator
-from ifo_grounding.transforms._common import InstructionTransform
+from ifo_grounding.transforms.base import InstructionTransform
 from ifo_grounding.transforms.choosing import (
     PoolScorer,
     check_options,
