@@ -36,12 +36,12 @@ from ifo_grounding.transforms import InstructionSampler
 from ifo_grounding.world import (
     Canvas,
     Layout,
+    WorldState,
     random_layout,
     render,
     step,
     tile_index,
     tile_table,
-    walk,
 )
 
 DEVICE = "cpu"
@@ -73,6 +73,11 @@ def world_step() -> Row:
     batch, steps = 4096, 200
     first = random_layout(batch, device=DEVICE)
     actions = torch.randint(6, (steps, batch), device=DEVICE)
+
+    def walk(state: WorldState, some: torch.Tensor) -> WorldState:
+        for action in some:
+            state = step(state, action)
+        return state
 
     def play(advance: Callable, at_once: int) -> float:
         state = first

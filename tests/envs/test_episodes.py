@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from envs.stepping import assert_same, choose, everything, scenes
+from envs.stepping import choose, everything, scenes
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
@@ -239,37 +239,3 @@ def test_the_exposed_state_is_what_the_pixels_show_all_along():
     for td in (rollout, rollout["next"]):
         state = WorldState(**td["state"].to_dict(), batch_size=td.batch_size)
         assert torch.equal(render(state), td["pixels"])
-
-
-def test_an_episode_can_begin_in_a_given_state():
-    env = PickAndPlaceEnv("pick-out", 5, seed=0, expose_state=True)
-    first = env.reset().clone()
-    later = env.reset()
-    assert not torch.equal(first["pixels"], later["pixels"])
-    again = env.reset(first.clone(), set_state=True)
-    assert_same(again, first)
-    assert env.scene_numbers.tolist() == [-1] * 5
-    for _ in range(40):
-        wise = expert.act(env.truth.state, env.truth.wanted)
-        again = choose(env, again, wise).exclude("reward")
-        if again["done"].all():
-            break
-    goals = grammar("pick-out").parse_tokens(first["instruction"])
-    start = WorldState(**first["state"].to_dict(), batch_size=[5])
-    ends = zip(plain(start), plain(env.truth.state), wishes(goals), strict=True)
-    assert all(holds(*episode) for episode in ends)
-
-
-def test_a_given_state_needs_no_instruction_where_there_are_none():
-    env = PickAndPlaceEnv("pick", 5, seed=0, expose_state=True, instructed=False)
-    first = env.reset().clone()
-    env.reset()
-    assert_same(env.reset(first.clone(), set_state=True), first)
-
-
-def test_steps_begin_at_the_state_in_the_tensordict():
-    env = PickAndPlaceEnv("move", 3, seed=0, expose_state=True)
-    td = env.reset()
-    td["state", "arm"] = torch.tensor([35, 0, 7])
-    after = choose(env, td, torch.tensor([0, 1, 2]))
-    assert after["state", "arm"].tolist() == [29, 1, 13]

@@ -185,13 +185,9 @@ def test_bad_arguments_are_refused(wrong, said):
 
 
 def test_bad_resets_are_refused():
-    env = PickAndPlaceEnv("move", 2, seed=0, expose_state=True)
+    env = PickAndPlaceEnv("move", 2, seed=0)
     with pytest.raises(UserError, match="start at 0"):
         env.reset(scenes(0, -1))
-    with pytest.raises(UserError, match="needs a tensordict with a state"):
-        env.reset(set_state=True)
-    with pytest.raises(UserError, match="needs an instruction beside the state"):
-        env.reset(env.reset().exclude("instruction"), set_state=True)
 
 
 def moved(env):

@@ -164,6 +164,18 @@ def test_a_users_own_environment(random_policy):
     assert first.scenes != success_rate(random_policy, env, episodes=80, seed=1).scenes
 
 
+def test_a_given_pick_and_place_env_plays_the_scenes_of_its_task(random_policy):
+    env = PickAndPlaceEnv("pick", num_envs=30, seed=9)
+    options = {"episodes": 70, "seed": 4, "stream": "validation"}
+    named = success_rate(random_policy, "pick", batch_size=30, **options)
+    given = success_rate(random_policy, env, **options)
+    assert given.scenes == named.scenes
+    assert torch.equal(given.outcomes, named.outcomes)
+    assert env.stream == "training"
+    env.set_seed(0)
+    assert torch.equal(env.reset()["pixels"], PickAndPlaceEnv("pick", 30, seed=0).reset()["pixels"])
+
+
 def test_environments_of_other_batch_shapes():
     env = SerialEnv(3, lambda: PickAndPlaceEnv("move", num_envs=2, seed=0))
     seen = set()
@@ -276,8 +288,10 @@ def test_success_is_seen_from_the_true_reward_where_there_are_others(up):
     model = TensorDictModule(
         lambda action: torch.zeros(*action.shape, 1), ["action"], ["action_score"]
     )
-    plain, paid = (PickAndPlaceEnv("move", num_envs=100, seed=0) for _ in range(2))
-    paid = TransformedEnv(paid, LearnedReward(model))
+    plain, paid = (
+        TransformedEnv(PickAndPlaceEnv("move", num_envs=100, seed=0), transform)
+        for transform in (None, LearnedReward(model))
+    )
     result = success_rate(up, paid, episodes=200)
     assert torch.equal(result.outcomes, success_rate(up, plain, episodes=200).outcomes)
     assert 0 < result.rate.successes < 20

@@ -11,7 +11,7 @@ from ifo_grounding.evaluation import episode_endings
 from ifo_grounding.modules import take_word_penalty
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy, make_value
 from ifo_grounding.networks.grounding import BEARINGS, MODIFIER, swap_words
-from ifo_grounding.networks.warm_start import trunk_of
+from ifo_grounding.networks.warm_start import instructed_network
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
 from ifo_grounding.training import FitConfig, fit
@@ -44,7 +44,7 @@ def test_colour_and_form_are_seen_apart():
 
 
 def test_each_word_adds_evidence_of_its_own(shapes):
-    trunk = trunk_of(make_policy(shapes, "strong", seed=0))
+    trunk = instructed_network(make_policy(shapes, "strong", seed=0)).trunk
     assert isinstance(trunk, GroundedTrunk)
     words = trunk.words
     with torch.no_grad():
@@ -57,7 +57,7 @@ def test_each_word_adds_evidence_of_its_own(shapes):
 
 
 def test_roles_do_not_hear_every_word_in_training(shapes):
-    words = trunk_of(make_policy(shapes, "strong", seed=0)).words
+    words = instructed_network(make_policy(shapes, "strong", seed=0)).trunk.words
     tokens = VOCABULARY.encode(["move to the red circle", "move to the blue diamond"])
     heard = [part.clone() for part in words.roles(tokens)]
     again = words.roles(tokens)
@@ -98,7 +98,7 @@ def test_what_words_say_is_penalised_in_training(shapes):
     )
     loss = ImitationLoss(policy, word_penalty=1.0)
     loss(batch)["loss_words"].backward()
-    words = trunk_of(policy).words
+    words = instructed_network(policy).trunk.words
     said = words.about_form.weight.grad.abs().sum(1) > 0
     assert said.nonzero().squeeze(1).tolist() == sorted(
         batch["instruction"][batch["instruction"] > 0].tolist()
@@ -110,7 +110,7 @@ def test_what_words_say_is_penalised_in_training(shapes):
 
 def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
     policy = make_policy(shapes, "strong", seed=0)
-    words = trunk_of(policy).words
+    words = instructed_network(policy).trunk.words
     sentences = ["move to the red circle", "move to the blue triangle"]
     batch = TensorDict(
         {
@@ -176,7 +176,7 @@ def what_is_seen(trunk, image, words="red circle"):
 @pytest.mark.parametrize("context", [0, 1, 2])
 def test_what_lies_around_is_seen(shapes, context):
     policy = make_policy(shapes, "strong", seed=0, context=context)
-    trunk = trunk_of(policy)
+    trunk = instructed_network(policy).trunk
     near, far = tiles("red circle", "blue triangle", arm=20), tiles("red circle", arm=20)
     far[:, :, 32:40, 8:16] = near[:, :, :8, 8:16]  # the triangle, elsewhere
     assert torch.allclose(what_is_seen(trunk, near), what_is_seen(trunk, far)) == (context == 0)
@@ -190,7 +190,7 @@ def test_what_lies_around_is_seen(shapes, context):
 
 
 def test_bearings_turn_all_places(shapes):
-    trunk = trunk_of(make_policy(shapes, "strong", seed=0, context=1))
+    trunk = instructed_network(make_policy(shapes, "strong", seed=0, context=1)).trunk
     maps, heads = 2 * trunk.words.relevance.out_channels, trunk.attention.out_features
     count = 2 * (heads + maps)
     with torch.no_grad():

@@ -14,7 +14,7 @@ from ifo_grounding.networks import (
     make_value,
     word_scoring,
 )
-from ifo_grounding.networks.warm_start import inherited, trunk_of
+from ifo_grounding.networks.warm_start import inherited, instructed_network
 
 SCORERS = [make_instruction_classifier, make_goal_classifier]
 EVERY = [make_value, make_reward_model, *SCORERS]
@@ -24,7 +24,7 @@ EVERY = [make_value, make_reward_model, *SCORERS]
 def test_a_trunk_is_copied_and_goes_its_own_way(shapes, preset, make):
     policy = make_policy(shapes, preset, seed=0)
     network = make(shapes, preset, init_from=policy, seed=1)
-    source, target = trunk_of(policy), network.module.trunk
+    source, target = instructed_network(policy).trunk, network.module.trunk
     assert all(map(torch.equal, source.state_dict().values(), target.state_dict().values()))
     assert all(torch.equal(now, then) for now, then in inherited(network))
     with torch.no_grad():
@@ -47,7 +47,7 @@ def test_a_classifier_of_paper_copies_sentences_gates_and_the_last_image(shapes,
     policy = make_policy(shapes, "paper", seed=0)
     classifier = make(shapes, "paper", init_from=policy, seed=1)
     tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
-    trunk, own = trunk_of(policy), classifier.module.trunk
+    trunk, own = instructed_network(policy).trunk, classifier.module.trunk
     assert torch.equal(classifier.encode_instruction(tokens), trunk.instruction(tokens))
     assert torch.equal(own.fusion.h.weight, trunk.fusion.h.weight)
     first, other, now = torch.randint(256, (3, 5, *shapes.image_shape), dtype=torch.uint8)
@@ -62,7 +62,7 @@ def test_a_classifier_of_strong_copies_what_words_mean(shapes, make, monkeypatch
     policy = make_policy(shapes, seed=0)
     classifier = make(shapes, init_from=policy, seed=1)
     tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
-    trunk = trunk_of(policy)
+    trunk = instructed_network(policy).trunk
     start, now = torch.randint(256, (2, 5, *shapes.image_shape), dtype=torch.uint8)
     features = classifier.encode_scenes(*(start, now)[-classifier.images :]).features
     words_said = classifier.images * shapes.vocabulary_size
@@ -82,5 +82,8 @@ def test_a_classifier_of_strong_copies_what_words_mean(shapes, make, monkeypatch
 def test_roles_of_words_are_copied_where_asked(shapes):
     policy = make_policy(shapes, seed=0)
     classifier = make_instruction_classifier(shapes, init_from=policy, roles=True, seed=1)
-    own, theirs = classifier.module.words.state_dict(), trunk_of(policy).words.state_dict()
+    own, theirs = (
+        classifier.module.words.state_dict(),
+        instructed_network(policy).trunk.words.state_dict(),
+    )
     assert all(torch.equal(own[name], weight) for name, weight in theirs.items())

@@ -136,22 +136,6 @@ def test_nothing_suitable_is_one_clear_line():
     assert isinstance(caught.value, UserError) and isinstance(caught.value, RuntimeError)
 
 
-@pytest.mark.parametrize("served_before", [False, True])
-def test_where_some_states_were_served_it_tries_for_longer(served_before):
-    judge = classifier()
-    world = CounterWorld((3,))
-    env = make(world=world, judge=judge, max_tries=150)
-    if served_before:
-        env.reset()
-    before = world.resets.clone()
-    with torch.no_grad():
-        judge.module.sharpness.fill_(1.0)  # every probability is below 0.8
-    tries = 150 if served_before else 100
-    with pytest.raises(NothingSuitableError, match=f"any of {tries} states in 3 of the rows"):
-        env.reset()
-    assert (world.resets - before).tolist() == [tries] * 3
-
-
 def test_mode_of_the_judge_is_left_alone():
     judge = classifier().train()
     env = make(judge=judge)

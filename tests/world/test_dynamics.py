@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ifo_grounding.keys import ACTIONS, N_ACTIONS
-from ifo_grounding.world import neighbour, random_layout, step, walk
+from ifo_grounding.world import neighbour, random_layout, step
 from ifo_grounding.world.dynamics import DOWN, LEFT, PICK_PLACE, RIGHT, STOP, UP
 from reference import LETTERS, Plain, plain, worlds
 
@@ -92,13 +92,3 @@ def test_neighbours_at_a_corner():
     cells, inside = neighbour(cell, torch.arange(4), 6)
     assert cells.tolist() == [0, 1, 6, 0]
     assert inside.tolist() == [False, True, True, False]
-
-
-def test_a_walk_is_its_steps_and_can_be_compiled_as_a_whole():
-    first, actions = random_layout(64), torch.randint(6, (4, 64))
-    expected = first
-    for action in actions:
-        expected = step(expected, action)
-    compiled = torch.compile(walk, fullgraph=True, dynamic=False, backend="eager")
-    for last in (walk(first, actions), compiled(first, actions)):
-        assert (last == expected).all()

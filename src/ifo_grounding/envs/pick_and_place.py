@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 from typing import Any
 
@@ -18,7 +19,7 @@ from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.tasks.goals import MAX_STEPS
 from ifo_grounding.tasks.scenes import STATE_LEAVES, Scene, SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
-from ifo_grounding.world import N_BOXES, N_KINDS, Layout, WorldState
+from ifo_grounding.world import N_BOXES, N_KINDS, Layout
 from ifo_grounding.world.tiles import TILE_SIZES
 
 RENDER_TILE_SIZE = 32
@@ -44,7 +45,7 @@ class PickAndPlaceEnv(EnvBase):
         instructed: whether scenes come with a suitable instruction. Without, there is no goal, no
             instruction and no reward.
         expose_state: whether the true state is in the tensordict, for tools other than learners:
-            adds ``("state", ...)`` entries that steps read, and ``reset(td, set_state=True)``.
+            adds ``("state", ...)`` entries, which are shown and never read.
         holdout: named list of colour-shape pairs that the split ``train`` does not mention.
         holdout_visible: whether these pairs are still seen in scenes of the split ``train``.
         stream: ``training``, ``validation`` or ``evaluation`` scenes.
@@ -103,7 +104,6 @@ class PickAndPlaceEnv(EnvBase):
         super().__init__(device=device or "cpu", batch_size=[num_envs])
         self.num_envs, self.tile_size = num_envs, tile_size
         self.expose_state, self.instructed = expose_state, instructed
-        self._supports_set_state = expose_state
         self.vocabulary_size, self.instruction_length = len(VOCABULARY), VOCABULARY.length
         seed = secrets.randbits(31) if seed is None else seed
         self._simulator = Simulator(self.options, num_envs, seed, tile_size, self.device)
@@ -116,8 +116,17 @@ class PickAndPlaceEnv(EnvBase):
         return self.options.task
 
     @property
+    def stream(self) -> str:
+        """Name of the stream of scenes; another one that is set is gone to at the next seeding."""
+        return self.options.stream
+
+    @stream.setter
+    def stream(self, stream: str) -> None:
+        self.options = self._simulator.options = dataclasses.replace(self.options, stream=stream)
+
+    @property
     def scene_numbers(self) -> Tensor:
-        """Number of the scene that each row began with, int64 [num_envs]; -1 where it has none."""
+        """Number of the scene that each row began with, int64 [num_envs]."""
         return self._simulator.numbers
 
     @property
@@ -156,7 +165,6 @@ class PickAndPlaceEnv(EnvBase):
             )
         if self.expose_state:
             observation[STATE] = self._world_spec()
-            self.state_spec = Composite({STATE: self._world_spec()}, shape=batch, device=device)
         self.observation_spec = observation
         self.action_spec = Categorical(keys.N_ACTIONS, shape=batch, device=device)
         self.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
@@ -189,21 +197,13 @@ class PickAndPlaceEnv(EnvBase):
         else:
             rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
         given = self._empty() if tensordict is None else tensordict
+        numbers = given.get(keys.SCENE, None)
+        if numbers is not None:
+            numbers = numbers.reshape(self.num_envs)[rows]
+        self._simulator.reset(rows, numbers)
         tokens = given.get(keys.INSTRUCTION, None) if self.instructed else None
-        if kwargs.get("set_state"):
-            if STATE not in given:
-                raise UserError("reset(set_state=True) needs a tensordict with a state")
-            if tokens is None and self.instructed:
-                raise UserError("reset(set_state=True) needs an instruction beside the state")
-            self._simulator.place(rows, Scene.unasked(self._world(given[STATE])[rows]))
-        else:
-            numbers = given.get(keys.SCENE, None)
-            if numbers is not None:
-                numbers = numbers.reshape(self.num_envs)[rows]
-            self._simulator.reset(rows, numbers)
-            if numbers is None or keys.PIXELS in given:  # an observation, whose instruction is over
-                tokens = None
-        if tokens is not None:
+        # The instruction of an observation is over.
+        if tokens is not None and numbers is not None and keys.PIXELS not in given:
             self._simulator.ask(rows, tokens[rows])
         result = self._observe()
         for name in DONE:
@@ -216,8 +216,7 @@ class PickAndPlaceEnv(EnvBase):
         """Keep what the reset shows of all rows, new and running ones.
 
         EnvBase chooses between old and new pixel by pixel, which takes longer than all else in a
-        step. Only where states can be given does the caller know better than the simulator. Entries
-        of others are blank where an episode begins, as EnvBase leaves them.
+        step. Entries of others are blank where an episode begins, as EnvBase leaves them.
         """
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is None or mask is None or self.expose_state:
@@ -236,8 +235,6 @@ class PickAndPlaceEnv(EnvBase):
         return tensordict.exclude("_reset", *self._shown).apply(blank).update(merged)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.expose_state and (given := tensordict.get(STATE, None)) is not None:
-            self._simulator.state = self._world(given)
         if self.instructed:
             self._check_instruction(tensordict.get(keys.INSTRUCTION, None))
         success, terminated, truncated = self._simulator.step(tensordict.get(keys.ACTION))
@@ -272,11 +269,6 @@ class PickAndPlaceEnv(EnvBase):
             leaves = {leaf: getattr(state, leaf).clone() for leaf in STATE_LEAVES}
             result[STATE] = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
         return result
-
-    def _world(self, given: TensorDictBase) -> WorldState:
-        return WorldState(
-            **{leaf: given[leaf] for leaf in STATE_LEAVES}, batch_size=self.batch_size
-        )
 
     def _set_seed(self, seed: int | None) -> None:
         self._simulator.seed(secrets.randbits(31) if seed is None else seed)

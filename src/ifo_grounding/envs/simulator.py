@@ -13,14 +13,10 @@ from ifo_grounding.tasks.scenes import (
     Scene,
     SceneOptions,
     plan_leaves,
-    scene_leaves,
     state_leaves,
 )
 from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.world import Canvas, WorldState, render, step
-
-MOST_REMEMBERED = 8
-"""Steps and resets between two pictures of all worlds, beyond which all cells are looked at."""
 
 
 def check_actions(action: Tensor, worlds: int, count: int) -> None:
@@ -79,18 +75,8 @@ class Simulator:
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.numbers = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._episodes: _Episodes | None = None
-        self._prepare()
+        self._canvas = Canvas(tile_size)
         self.seed(seed)
-
-    def _prepare(self) -> None:
-        """Make what drawing needs, on the simulator's device."""
-        self._canvas = Canvas(self.tile_size)
-        # Places that may have changed since all were drawn, world and cell as one number.
-        self._touched: list[Tensor] | None = None  # None: any place
-        cells = self.options.layout.size**2
-        self._every_row = torch.arange(self.num_envs, device=self.device)
-        self._first_cell = cells * self._every_row
-        self._every_cell = torch.arange(cells, device=self.device)
 
     def seed(self, seed: int) -> None:
         """Go to the first scene of the stream of this seed."""
@@ -107,8 +93,8 @@ class Simulator:
         if self._episodes is not None:
             scene = self.scene.to(self.device)
             self._episodes = _Episodes(scene.state, scene.wanted, scene.instruction)
-        self._prepare()
-        self.stream = SceneStream(self.options, self.stream.seed, self.device)
+        self._canvas = Canvas(self.tile_size)
+        self.stream = SceneStream(self.stream.options, self.stream.seed, self.device)
         return self
 
     @property
@@ -120,13 +106,6 @@ class Simulator:
     def state(self) -> WorldState:
         """The worlds as they are, [num_envs]."""
         return self._running.state
-
-    @state.setter
-    @torch.inference_mode(False)
-    def state(self, state: WorldState) -> None:
-        # A copy: later resets write into the simulator's state, not into the caller's.
-        self._running.state = state.clone()
-        self._touched = None
 
     @property
     def scene(self) -> Scene:
@@ -161,23 +140,12 @@ class Simulator:
             numbers = torch.arange(first, first + len(rows), device=self.device)
             self.next_number += len(rows)
         if self._episodes is None:
-            self.place(rows, self.stream.scenes(numbers))
-        else:
-            self.stream.write(numbers, self._episodes.leaves(), rows)
-            self._begin(rows)
-        self.numbers = self.numbers.index_copy(0, rows, numbers)  # others may hold the old ones
-
-    @torch.inference_mode(False)
-    def place(self, rows: Tensor, scenes: Scene) -> None:
-        """Begin episodes with given scenes [R] in some rows."""
-        if self._episodes is None:
             # Every row needs a valid scene before any of them is replaced.
-            every = scenes[torch.zeros(self.num_envs, dtype=torch.int64)].clone()
+            every = self.stream.scenes(numbers[:1].expand(self.num_envs)).clone()
             self._episodes = _Episodes(every.state, every.wanted, every.instruction)
-        for leaf, new in zip(self._episodes.leaves(), scene_leaves(scenes), strict=True):
-            leaf.index_copy_(0, rows, new)
-        self._begin(rows)
-        self.numbers = self.numbers.index_fill(0, rows, -1)
+        self.stream.write(numbers, self._episodes.leaves(), rows)
+        self.steps[rows] = 0
+        self.numbers = self.numbers.index_copy(0, rows, numbers)  # others may hold the old ones
 
     @torch.inference_mode(False)
     def ask(self, rows: Tensor, tokens: Tensor) -> None:
@@ -191,18 +159,6 @@ class Simulator:
         for leaf, new in zip(self._running.asked, [*plan_leaves(wanted), tokens], strict=True):
             leaf.index_copy_(0, rows, new.to(leaf))
 
-    def _begin(self, rows: Tensor) -> None:
-        self.steps[rows] = 0
-        self._touch(rows, self._every_cell.expand(len(rows), -1))
-
-    def _touch(self, rows: Tensor, cells: Tensor) -> None:
-        """Remember that cells [R, K] of some rows may have changed since all were drawn."""
-        if self._touched is None or len(self._touched) == MOST_REMEMBERED:
-            self._touched = None
-        else:
-            first = self._first_cell.index_select(0, rows).unsqueeze(-1)
-            self._touched.append((first + cells).view(-1))
-
     @torch.inference_mode(False)
     def step(self, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Apply one action, int64 [num_envs], to each row.
@@ -215,11 +171,7 @@ class Simulator:
             UserError: where actions have another shape, such as one-hot actions, or are others.
         """
         check_actions(action, self.num_envs, keys.N_ACTIONS)
-        before = self._running.state
-        self._running.state = state = step(before, action)
-        if self._touched is not None:
-            # Side by side, for pictures are drawn fastest in the order in which they lie.
-            self._touch(self._every_row, torch.stack([before.arm, state.arm], dim=-1))
+        self._running.state = state = step(self.state, action)
         self.steps = self.steps + 1
         terminated = action == keys.STOP
         truncated = (self.steps >= self.options.max_steps) & ~terminated
@@ -232,9 +184,7 @@ class Simulator:
     def pixels(self, rows: Tensor | None = None, tile_size: int | None = None) -> Tensor:
         """Draw some rows or all of them, uint8 [R, 3, H, W]."""
         if rows is None and tile_size is None:
-            # On a GPU all cells are drawn.
-            touched, self._touched = self._touched, [] if self.device.type == "cpu" else None
-            return self._canvas.draw(self.state, torch.cat(touched) if touched else None)
+            return self._canvas.draw(self.state)
         state = self.state if rows is None else self.state[rows]
         return render(state, tile_size or self.tile_size)
 

@@ -113,7 +113,7 @@ def _batches_of(
 ) -> Iterator[tuple[EnvBase, TensorDictBase, int]]:
     """Yield batches as :func:`_numbered` does, in an environment that is given."""
     _check_given(env, env_options)
-    if isinstance(env, GymnasiumEnv):
+    if isinstance(env, GymnasiumEnv | PickAndPlaceEnv):
         check_choice("stream", stream, STREAMS)
         kept, env.stream = env.stream, stream
         env.set_seed(seed)
@@ -125,7 +125,7 @@ def _batches_of(
     if list(numbers) != [*range(len(numbers))]:
         raise UserError(
             "this environment cannot be reset to a scene by its number: ask for the first ones, "
-            "range(n), name a task, or use from_gymnasium"
+            "range(n), name a task, or give a PickAndPlaceEnv or one of from_gymnasium as it is"
         )
     rows = env.batch_size.numel()
     for batch, first in enumerate(range(0, len(numbers), rows)):

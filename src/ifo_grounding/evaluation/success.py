@@ -64,7 +64,9 @@ def success_rate(
     Args:
         policy: writes an action into a tensordict, a TensorDictModule mostly.
         env_or_task: name of a task; or an instructed batched environment with a true reward,
-            which is seeded anew and used as it is.
+            which is seeded anew and used as it is. A
+            :class:`~ifo_grounding.envs.PickAndPlaceEnv` plays the scenes that its task's name
+            would.
         mode: ``greedy`` (the headline), ``sampled``, or ``both``: greedy, with the sampled
             policy's result as its :attr:`SuccessResult.sampled`.
         episodes: number of scenes.

@@ -7,17 +7,15 @@ from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
 from ifo_grounding.networks.goal import make_goal_classifier
 from ifo_grounding.networks.grounding import GroundedTrunk, WordMaps
 from ifo_grounding.networks.instruction import make_instruction_classifier
-from ifo_grounding.networks.inverse import InverseNetwork, make_inverse
+from ifo_grounding.networks.inverse import make_inverse
 from ifo_grounding.networks.layers import GatedAttention, ResidualBlock, pool_cells
 from ifo_grounding.networks.persistence import load, save
 from ifo_grounding.networks.policy import (
-    PolicyNetwork,
-    ValueNetwork,
     attention_maps,
     make_policy,
     make_value,
 )
-from ifo_grounding.networks.reward import RewardNetwork, make_reward_model
+from ifo_grounding.networks.reward import make_reward_model
 from ifo_grounding.networks.scoring import GatedScorer, PairScorer
 from ifo_grounding.networks.sentences import GRUInstructionEncoder
 from ifo_grounding.networks.shapes import Shapes
@@ -34,15 +32,11 @@ __all__ = [
     "GatedScorer",
     "GatedTrunk",
     "GroundedTrunk",
-    "InverseNetwork",
     "NetworkConfig",
     "PairScorer",
     "PatchEncoder",
-    "PolicyNetwork",
     "ResidualBlock",
-    "RewardNetwork",
     "Shapes",
-    "ValueNetwork",
     "WordMaps",
     "WordScorer",
     "attention_maps",

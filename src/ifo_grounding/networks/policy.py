@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,26 +16,11 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from ifo_grounding import keys
 from ifo_grounding.networks.building import Blueprint, Shareable, build
-from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.shapes import Shapes, check_categorical
+from ifo_grounding.networks.shapes import check_categorical
 from ifo_grounding.networks.trunk import InstructedNetwork
 from ifo_grounding.networks.warm_start import instructed_network, start_trunk
 
 INPUTS: tuple[NestedKey, NestedKey] = (keys.PIXELS, keys.INSTRUCTION)
-
-
-class PolicyNetwork(InstructedNetwork):
-    """phi(s, t) -> logits of the actions, float32 [*B, A]."""
-
-    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
-        super().__init__(shapes, config, shapes.n_actions)
-
-
-class ValueNetwork(InstructedNetwork):
-    """V(s, t), float32 [*B, 1]."""
-
-    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
-        super().__init__(shapes, config, 1)
 
 
 class Policy(Shareable, ProbabilisticActor):
@@ -107,7 +93,7 @@ def make_policy(
         "deterministic": deterministic,
     }
     return build(
-        "policy", PolicyNetwork, spec_source, preset, options, device, seed, overrides, actor
+        "policy", InstructedNetwork, spec_source, preset, options, device, seed, overrides, actor
     )
 
 
@@ -149,9 +135,8 @@ def make_value(
     def critic(network: nn.Module, plan: Blueprint) -> Value:
         return Value(network, plan.options["in_keys"], [out_key])
 
-    value = build(
-        "value", ValueNetwork, spec_source, preset, options, device, seed, overrides, critic
-    )
+    network = partial(InstructedNetwork, outputs=1)
+    value = build("value", network, spec_source, preset, options, device, seed, overrides, critic)
     if init_from is not None:
         start_trunk(value.module, init_from)
     return value

@@ -13,17 +13,12 @@ from torch import Tensor, nn
 from ifo_grounding import keys
 from ifo_grounding.networks.base import same_batch
 from ifo_grounding.networks.building import build
-from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.trunk import InstructedNetwork
 from ifo_grounding.networks.warm_start import start_trunk
 
 
 class RewardNetwork(InstructedNetwork):
     """rwd(s, t, a): one logit per action, of which the action at hand is read."""
-
-    def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
-        super().__init__(shapes, config, shapes.n_actions)
 
     def all_actions(self, pixels: Tensor, instruction: Tensor) -> Tensor:
         """Score every action: logits, float32 [*B, A]."""

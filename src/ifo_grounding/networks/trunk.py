@@ -48,13 +48,19 @@ class GatedTrunk(nn.Module):
 
 
 class InstructedNetwork(ImageNetwork):
-    """The preset's trunk and a head: what policy, critic and reward model are made of."""
+    """The preset's trunk and a head: policy, critic, and what the reward model is made of.
 
-    def __init__(self, shapes: Shapes, config: NetworkConfig, outputs: int) -> None:
+    Args:
+        shapes: sizes of inputs.
+        config: sizes of the network.
+        outputs: how many; by default a logit for each action.
+    """
+
+    def __init__(self, shapes: Shapes, config: NetworkConfig, outputs: int | None = None) -> None:
         super().__init__(shapes, config)
         kind = GatedTrunk if config.preset == "paper" else GroundedTrunk
         self.trunk: GatedTrunk | GroundedTrunk = kind(shapes, config)
-        self.head = head(self.trunk.size, config, outputs)
+        self.head = head(self.trunk.size, config, outputs or shapes.n_actions)
 
     def forward(self, pixels: Tensor, instruction: Tensor) -> Tensor:
         """Map pixels [*B, C, H, W] and token ids [*B, L] to float32 [*B, outputs]."""

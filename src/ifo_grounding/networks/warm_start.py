@@ -14,18 +14,14 @@ from ifo_grounding.networks.word_scoring import WordScorer
 Parts = list[tuple[nn.Module, nn.Module]]
 
 
-def trunk_of(policy: nn.Module) -> GatedTrunk | GroundedTrunk:
-    """Return the trunk of a policy that ``make_policy`` built.
+def instructed_network(policy: nn.Module) -> InstructedNetwork:
+    """Return the network within a policy that ``make_policy`` built.
 
     >>> from ifo_grounding.networks import Shapes, make_policy
-    >>> trunk_of(make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))).size
+    >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
+    >>> instructed_network(policy).trunk.size
     312
     """
-    return instructed_network(policy).trunk
-
-
-def instructed_network(policy: nn.Module) -> InstructedNetwork:
-    """Return the network within a policy that ``make_policy`` built."""
     found = [part for part in policy.modules() if isinstance(part, InstructedNetwork)]
     if len(found) != 1:
         raise UserError("this must be a policy built by make_policy")

@@ -10,7 +10,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.seeding import STREAMS, Generators, Shares, draw_rows, generator
+from ifo_grounding.seeding import STREAMS, Generators, draw_rows, generator
 from ifo_grounding.tasks.goals import (
     MAX_STEPS,
     MOVE_UDLR,
@@ -119,19 +119,18 @@ def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
     numbers = range(block * AHEAD, (block + 1) * AHEAD)
     draws = [generator(seed, "scenes", options.stream, number) for number in numbers]
     missing = torch.full((AHEAD,), CHUNK)
-    needed = CHUNK
     proposed: list[_Proposal] = []
     rows: list[Tensor] = []
     owners: list[Tensor] = []
     for _ in range(PATIENCE):
         unfinished = missing.nonzero().squeeze(-1)
         sources = [draws[chunk] for chunk in unfinished]
-        proposal, good = _propose_enough(options, sources, missing[unfinished], needed)
+        proposal, good = _propose(options, sources)
         good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
         missing[unfinished] -= good.sum(1)
         before = sum(len(each.wording) for each in proposed)
         owner, place = good.nonzero(as_tuple=True)
-        rows.append(before + owner * good.shape[1] + place)
+        rows.append(before + owner * CHUNK + place)
         proposed.append(proposal)
         owners.append(unfinished[owner])
         if not missing.any():
@@ -141,8 +140,6 @@ def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
         if len(proposed) == ROUNDS_HELD:
             proposed = [_chosen(proposed, torch.cat(rows))]
             rows = [torch.arange(len(proposed[0].wording))]
-        share = float(good.float().mean())
-        needed = min(CHUNK, int(1.15 * int(missing.max()) / max(share, 1e-3)) + 16)
     raise UserError(
         f"after {PATIENCE * CHUNK} draws only {CHUNK - int(missing.max())} scenes admit a "
         f"suitable goal of {options.task!r} in split {options.split!r} within "
@@ -151,33 +148,9 @@ def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
     )
 
 
-def _propose_enough(
-    options: SceneOptions, draws: list[torch.Generator], missing: Tensor, needed: int
-) -> tuple[_Proposal, Tensor]:
-    """Draw a chunk of scenes with each generator, and look at no more of them than it takes.
-
-    Args:
-        options: which scenes.
-        draws: generators, G of them.
-        missing: how many scenes each still has to find, int64 [G].
-        needed: how many of a chunk should do; all are looked at if they do not.
-
-    Returns:
-        As many scenes of each generator as were looked at, [G * K], and which of them have a
-        suitable goal, bool [G, K].
-    """
-    before = [draw.get_state() for draw in draws]
-    scenes, good = _propose(options, Shares(draws, CHUNK, needed))
-    if needed == CHUNK or (good.sum(1) >= missing).all():
-        return scenes, good
-    for draw, state in zip(draws, before, strict=True):
-        draw.set_state(state)
-    return _propose(options, Shares(draws, CHUNK, CHUNK))
-
-
-def _propose(options: SceneOptions, draws: Shares) -> tuple[_Proposal, Tensor]:
-    """Draw scenes with each generator, and say which are suitable."""
-    n = len(draws)
+def _propose(options: SceneOptions, draws: list[torch.Generator]) -> tuple[_Proposal, Tensor]:
+    """Draw a chunk of scenes with each of G generators, and say which are suitable, [G, CHUNK]."""
+    n = CHUNK * len(draws)
     state = random_layout(n, options.shown_layout, generator=draws)
     goal = propose_goal(state, check_task(options.task), draws)
     wanted = plan(state, goal, options.max_steps)
@@ -188,7 +161,7 @@ def _propose(options: SceneOptions, draws: Shares) -> tuple[_Proposal, Tensor]:
     good = wanted.verdict == SUITABLE
     if not options.instructed:
         good = torch.ones_like(good)
-    return _Proposal(state, wanted, goal, wording), good.view(len(draws.generators), -1)
+    return _Proposal(state, wanted, goal, wording), good.view(len(draws), CHUNK)
 
 
 class _Proposal(NamedTuple):

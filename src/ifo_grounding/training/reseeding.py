@@ -11,7 +11,7 @@ from torchrl.envs.transforms import Transform
 from ifo_grounding.attributes import first_worker
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.loop import Metrics
-from ifo_grounding.transforms._common import parts_of
+from ifo_grounding.transforms.base import parts_of
 
 
 def reseed(env: EnvBase, seed: int) -> None:

@@ -28,7 +28,7 @@ from ifo_grounding.training.reseeding import (
     transforms_of,
     workers_fix_scenes,
 )
-from ifo_grounding.transforms._common import exposes_state, instructs
+from ifo_grounding.transforms.base import exposes_state, instructs
 
 ALGORITHMS = ("ppo", "reinforce")
 NAME = "self-examination"

@@ -14,7 +14,7 @@ from torch import Tensor
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.keys import PIXELS, SUITABILITY
 from ifo_grounding.modules import device_of, evaluating, output_key
-from ifo_grounding.transforms._common import flat_logit
+from ifo_grounding.transforms.base import flat_logit
 
 CHOICES = ("random", "best")
 AT_ONCE = 2048

@@ -14,7 +14,7 @@ from torchrl.data import Composite, Unbounded
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import ACTION, ACTION_SCORE, LEARNED_REWARD, NEXT
 from ifo_grounding.modules import device_of, evaluating, output_key
-from ifo_grounding.transforms._common import EpisodeTransform, flat_logit, parts_of
+from ifo_grounding.transforms.base import EpisodeTransform, flat_logit, parts_of
 
 ROWS_AT_ONCE = 4096
 """Rows that a model scores together, to bound memory."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.keys import INSTRUCTION, PIXELS
 from ifo_grounding.seeding import generator
-from ifo_grounding.transforms._common import InstructionTransform
+from ifo_grounding.transforms.base import InstructionTransform
 from ifo_grounding.transforms.choosing import (
     PoolScorer,
     check_options,
@@ -24,10 +24,6 @@ from ifo_grounding.transforms.choosing import (
 
 class NothingSuitableError(UserError, RuntimeError):
     """No instruction of the pool suited any state that the simulator drew."""
-
-
-HOPELESS = 100
-"""States in a row that may be drawn for one row while none has ever been served."""
 
 
 class InstructionSampler(InstructionTransform):
@@ -49,8 +45,7 @@ class InstructionSampler(InstructionTransform):
         candidates: instructions drawn for each state; the whole pool if it is smaller.
         choose: ``random`` among the suitable ones (then only as many are scored as it takes to find
             one), or the ``best``.
-        max_tries: states drawn for one row before giving up; no more than 100 while no state has
-            ever been served.
+        max_tries: states drawn for one row before giving up.
         seed: seed of the choices.
         in_keys: key of the image.
         out_keys: key of the instruction.
@@ -91,7 +86,6 @@ class InstructionSampler(InstructionTransform):
         check_options(threshold, candidates, choose)
         max_tries = at_least_one("max_tries", max_tries)
         self.threshold, self.candidates, self.choose = threshold, candidates, choose
-        self._hopeful = False  # whether any state has ever been served
         self.max_tries = max_tries
         distinct = check_pool(pool).unique(dim=0)
         self.scorer = PoolScorer(classifier, distinct, self.in_keys[0])
@@ -154,7 +148,6 @@ class InstructionSampler(InstructionTransform):
         )
         self._drawn += len(index)
         self._served += int((index >= 0).sum())
-        self._hopeful |= bool(self._served)
         self._score_sum += float(score[index >= 0].sum())
         return index, score
 
@@ -167,7 +160,7 @@ class InstructionSampler(InstructionTransform):
         pixels = tensordict_reset.get(self.in_keys[0])
         instruction = self.pool.new_zeros(rows, self.pool.shape[1], device=pixels.device)
         best_score, attempt = 0.0, 0
-        while len(waiting) and attempt < self._patience():
+        while len(waiting) and attempt < self.max_tries:
             if attempt:
                 tensordict_reset = self._draw_again(tensordict_reset, waiting)
             pixels = tensordict_reset.get(self.in_keys[0])
@@ -182,10 +175,6 @@ class InstructionSampler(InstructionTransform):
             raise NothingSuitableError(self._complaint(len(waiting), attempt, best_score))
         tensordict_reset.set(self.out_keys[0], instruction.reshape(*batch, -1))
         return tensordict_reset
-
-    def _patience(self) -> int:
-        """Return how many states may be drawn for one row by now."""
-        return self.max_tries if self._hopeful else min(self.max_tries, HOPELESS)
 
     def _complaint(self, waiting: int, tries: int, best_score: float) -> str:
         return (

@@ -15,7 +15,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
 from ifo_grounding.mosaic import PIXELS_PER_WORD, as_words
 from ifo_grounding.seeding import generator
-from ifo_grounding.transforms._common import InstructionTransform
+from ifo_grounding.transforms.base import InstructionTransform
 from ifo_grounding.transforms.choosing import check_pool
 
 FRAME_HASH = "frame_hash"

@@ -1,6 +1,6 @@
 """What is true: a pure, batched grid world in plain torch."""
 
-from ifo_grounding.world.dynamics import neighbour, step, walk
+from ifo_grounding.world.dynamics import neighbour, step
 from ifo_grounding.world.layout import Layout, random_layout
 from ifo_grounding.world.state import (
     BOX_COLOURS,
@@ -31,5 +31,4 @@ __all__ = [
     "step",
     "tile_index",
     "tile_table",
-    "walk",
 ]

@@ -66,27 +66,6 @@ def step(state: WorldState, action: Tensor) -> WorldState:
     )
 
 
-def walk(state: WorldState, actions: Tensor) -> WorldState:
-    """Apply several actions to each world, one after the other.
-
-    ``torch.compile(walk, dynamic=False)`` makes one loop of them, three times as fast as
-    :func:`step` for some five actions at a time.
-
-    Args:
-        state: worlds [*B].
-        actions: int64 [T, *B].
-
-    Returns:
-        The worlds after the last action, [*B].
-
-    >>> walk(WorldState.empty(1, size=6), torch.tensor([[DOWN], [RIGHT], [UP]])).arm
-    tensor([1])
-    """
-    for action in actions:
-        state = step(state, action)
-    return state
-
-
 _DESTINATIONS: dict[tuple[int, torch.device], Tensor] = {}
 
 

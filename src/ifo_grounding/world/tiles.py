@@ -77,22 +77,6 @@ def _tile_index(state: WorldState) -> Tensor:
     return index.unflatten(-1, (size, size))
 
 
-def _tiles_at(state: WorldState, places: Tensor) -> Tensor:
-    """Return which tiles worlds [N] show in some places, int16 [M]: those of :func:`_tile_index`.
-
-    Args:
-        state: worlds.
-        places: where: world and cell as one number, int64 [M].
-    """
-    arm, held, objects = state.arm, state.held, state.objects
-    index = state.boxes.flatten().index_select(0, places).to(torch.int16)
-    index.add_(objects.flatten().index_select(0, places), alpha=N_BOXES + 1)
-    world = places.div(objects.shape[-1], rounding_mode="floor")
-    carried = held.index_select(0, world).to(torch.int16).add_(1).mul_(PLAIN)
-    there = arm.index_select(0, world).add_(world, alpha=objects.shape[-1]) == places
-    return index.add_(carried.mul_(there))
-
-
 def render(state: WorldState, tile_size: int = 8) -> Tensor:
     """Draw worlds.
 
@@ -127,44 +111,27 @@ class Canvas:
         self._shown: Tensor | None = None
         self._frames = torch.empty(0)
 
-    def draw(self, state: WorldState, places: Tensor | None = None) -> Tensor:
-        """Draw worlds.
-
-        Args:
-            state: worlds [N].
-            places: where they may have changed since the last picture: world and cell as one
-                number, int64 [M]; anywhere where None.
-
-        Returns:
-            Pixels, uint8 [N, 3, H, W], which the caller may write to.
-        """
+    def draw(self, state: WorldState) -> Tensor:
+        """Draw worlds [N]: pixels, uint8 [N, 3, H, W], which the caller may write to."""
         shown, shape = self._shown, (*state.arm.shape, state.size, state.size)
         words = _words(self.tile_size, str(state.arm.device))
         # A GPU would have to be waited for, to know what changed.
         if state.arm.device.type != "cpu" or math.prod(shape) < FEWEST_CELLS:
             return mosaic.assemble(words, _tile_index(state))
-        if shown is None or shown.shape != shape or not self._redraw(state, shown, places):
-            self._shown = _tile_index(state)
-            self._frames = mosaic.assemble(words, self._shown)
+        index = _tile_index(state)
+        if shown is None or shown.shape != shape or not self._redraw(index, shown):
+            self._frames = mosaic.assemble(words, index)
+        self._shown = index
         return self._frames.clone()
 
-    def _redraw(self, state: WorldState, shown: Tensor, places: Tensor | None) -> bool:
+    def _redraw(self, index: Tensor, shown: Tensor) -> bool:
         """Draw the cells that changed, if they are few enough."""
-        before = shown.view(-1)
-        if places is None:
-            index = _tile_index(state)
-            changed = index.view(-1).ne(before).nonzero().squeeze(-1)
-            tiles = index.view(-1).index_select(0, changed)
-        else:
-            found = _tiles_at(state, places)
-            new = found.ne(before.index_select(0, places)).nonzero().squeeze(-1)
-            changed, tiles = places.index_select(0, new), found.index_select(0, new)
-            mosaic.put(before, changed, tiles)
-            index = shown
-        if MOST_CHANGED * len(changed) > len(before):
+        tiles = index.view(-1)
+        changed = tiles.ne(shown.view(-1)).nonzero().squeeze(-1)
+        if MOST_CHANGED * len(changed) > len(tiles):
             return False
-        self._shown = index
-        mosaic.lay(self._frames, mosaic.words(tile_table(self.tile_size)), changed, tiles.long())
+        new = tiles.index_select(0, changed).long()
+        mosaic.lay(self._frames, mosaic.words(tile_table(self.tile_size)), changed, new)
         return True
 
 
