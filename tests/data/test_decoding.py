@@ -15,7 +15,6 @@ from torchrl.envs import Compose
 
 from ifo_grounding.data import FrameCodec, FrameDecoder
 from ifo_grounding.data.decoding import Lookup
-from ifo_grounding.errors import UserError
 from ifo_grounding.world import random_layout, render
 
 
@@ -63,12 +62,12 @@ def test_entries_can_be_rows_of_shared_frames(frames):
 
 def test_raw_frames_pass_through():
     noise = torch.randint(256, (12, 3, 20, 20), dtype=torch.uint8)
-    decoder = FrameDecoder(FrameCodec.fit(noise), ["pixels"])
+    decoder = FrameDecoder(FrameCodec.compress(noise)[0], ["pixels"])
     assert torch.equal(decoder(TensorDict({"pixels": noise}, [12]))["pixels"], noise)
 
 
 def test_missing_entries_are_named(frames):
-    decoder = FrameDecoder(FrameCodec.fit(frames), ["pixels"])
+    decoder = FrameDecoder(FrameCodec.compress(frames)[0], ["pixels"])
     with pytest.raises(KeyError, match="'pixels' not found"):
         decoder(TensorDict({}, []))
 

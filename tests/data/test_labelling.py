@@ -107,10 +107,10 @@ def test_a_buffer_takes_a_transform_and_no_storage():
 @pytest.mark.parametrize(("preset", "tile_size"), [("paper", 8), ("strong", 16), ("strong", None)])
 def test_pixels_are_read_where_tiles_are_no_patches(preset, tile_size, monkeypatch):
     demos = record_demonstrations("move", 20)
-    codec = FrameCodec.fit(demos.frames(torch.arange(demos.n_frames)), tile_size or 8)
+    shown = demos.frames(torch.arange(demos.n_frames))
+    codec, codes = FrameCodec.compress(shown, tile_size or 8)
     if tile_size is None:
-        codec = FrameCodec(demos.image_shape)
-    codes = codec.encode(demos.frames(torch.arange(demos.n_frames)))
+        codec, codes = FrameCodec(demos.image_shape), shown
     again = Demonstrations(
         codec, codes, demos.lengths, demos.instructions, vocabulary=demos.vocabulary
     )
@@ -167,7 +167,6 @@ def test_the_report_says_how_sure_the_model_was(inverse):
     assert rows[2] == {
         "action": 2, "count": 3, "mean": 0.75, "min": 0.5, "p01": 0.5, "p10": 0.5, "median": 0.75
     }  # fmt: skip
-    assert str(report).splitlines()[3].split() == ["2", "3", "0.7500", *["0.5000"] * 3, "0.7500"]
 
 
 def test_a_saved_report_makes_the_buffer_again(tmp_path, inverse):

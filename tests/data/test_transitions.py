@@ -74,7 +74,6 @@ def test_the_stop_can_be_rare():
     assert (report.taken[:5] - 235).abs().max() < 60
     _, report = collect_transitions(make_env(), 100, stop_probability=0.0)
     assert report.taken[5] == 0
-    assert str(report).splitlines()[6].split() == ["5", "0", "0"]
 
 
 def test_same_seeds_same_transitions():

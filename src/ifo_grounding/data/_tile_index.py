@@ -38,21 +38,6 @@ class TileIndex:
     def __len__(self) -> int:
         return len(self.words)
 
-    def find(self, rows: Tensor) -> Tensor:
-        """Return the numbers of ``rows`` [M, K], int64 [M].
-
-        Raises:
-            UserError: where a row is not in the index.
-        """
-        distinct, index = distinct_rows(rows)
-        numbers = [self._numbers.get(row.tobytes(), -1) for row in distinct.numpy()]
-        if unknown := numbers.count(-1):
-            raise UserError(
-                f"{unknown} tiles are not in the dictionary: fit the codec on these frames too, "
-                "or use update"
-            )
-        return torch.tensor(numbers, dtype=torch.int64)[index]
-
     def add(self, rows: Tensor) -> Tensor:
         """Return the numbers of ``rows`` [M, K], int64 [M], adding those that are new."""
         distinct, index = distinct_rows(rows)

@@ -65,14 +65,6 @@ class LabelReport:
             rows.append(row)
         return rows
 
-    def __str__(self) -> str:
-        names = ("count", "mean", *QUANTILES)
-        lines = ["action " + "".join(f"{name:>9}" for name in names)]
-        for row in self.summary():
-            cells = [f"{row[name]:9.4f}" if name in row else " " * 9 for name in names[1:]]
-            lines.append(f"{row['action']:<7}{row['count']:>9}" + "".join(cells))
-        return "\n".join(lines)
-
     def save(self, folder: str | Path) -> None:
         """Write a folder; :func:`labelled_buffer` makes the buffer again from it."""
         arrays = {"actions": self.actions, "confidence": self.confidence}

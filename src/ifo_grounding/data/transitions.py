@@ -96,11 +96,6 @@ class TransitionReport:
     kept: Tensor
     """Of these, steps in the buffer, int64 [A]."""
 
-    def __str__(self) -> str:
-        rows = zip(self.taken.tolist(), self.kept.tolist(), strict=True)
-        lines = [f"{action:<7}{taken:>9}{kept:>9}" for action, (taken, kept) in enumerate(rows)]
-        return "\n".join(["action     taken     kept", *lines])
-
 
 class Collected(NamedTuple):
     """Random transitions in a replay buffer, and their counts."""
