@@ -18,7 +18,6 @@ from ifo_grounding.report import (
     Case,
     animation,
     gallery,
-    improved_episodes,
     instruction_cases,
     trace_animation,
 )
@@ -126,19 +125,6 @@ def test_cases_agree_with_the_suitable_rate():
     assert [case.good for case in few] == [True] * 8 + [False] * 4
     none = instruction_cases(yes, "move", pool, threshold=0.99)
     assert none == []
-
-
-def test_both_policies_play_the_same_scenes():
-    def stop(td):
-        return td.set("action", torch.full(td.shape, 5))
-
-    def up(td):
-        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
-
-    episodes, titles = improved_episodes(stop, up, "move", [3, 1], max_steps=2)
-    assert titles == ["phase 1", "phase 1", "phase 2", "phase 2"]
-    assert [e.scene for e in episodes] == [3, 1, 3, 1]
-    assert [int(e.actions[0]) for e in episodes] == [5, 5, 0, 0]
 
 
 def test_a_step_is_a_picture_and_a_dollar_sign_no_formula():
