@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from ifo_grounding._folder import recipe_names, recipes_folder
+from ifo_grounding._overrides import check_options
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import objectives
-from ifo_grounding._folder import recipe_names, recipes_folder
-from ifo_grounding._overrides import check_options
 from ifo_grounding.cli import resolve
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.networks import (
