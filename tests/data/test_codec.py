@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ifo_grounding import mosaic
 from ifo_grounding.data import FrameCodec
 from ifo_grounding.errors import UserError
 from ifo_grounding.world import random_layout, render
@@ -64,14 +63,6 @@ def test_batch_dimensions_are_kept():
     assert torch.equal(codec.decode(codes[1, 2]), frames[1, 2])
 
 
-def test_noise_is_stored_as_pixels():
-    noise = torch.randint(256, (50, 3, 48, 48), dtype=torch.uint8)
-    codec, codes = FrameCodec.compress(noise)
-    assert (codec.tile_size, codec.tiles, codec.code_dtype) == (None, None, torch.uint8)
-    assert torch.equal(codes, noise)
-    assert repr(codec) == "FrameCodec(3x48x48, raw)"
-
-
 def test_a_long_stream_of_noise_is_given_up_on_the_way():
     generator = torch.Generator().manual_seed(0)
 
@@ -83,13 +74,6 @@ def test_a_long_stream_of_noise_is_given_up_on_the_way():
     generator.manual_seed(0)
     assert codec.tile_size is None
     assert torch.equal(codes, torch.cat(list(noise())))
-
-
-def test_pictures_are_laid_in_pieces_like_alone(monkeypatch):
-    frames = render(random_layout(20))
-    codec, codes = FrameCodec.compress(frames, tile_size=8)
-    monkeypatch.setattr(mosaic, "CHUNK_BYTES", 3 * frames[0].numel())
-    assert torch.equal(codec.decode(codes), frames)
 
 
 def test_codes_grow_with_the_dictionary():
@@ -148,13 +132,3 @@ def test_frames_may_begin_anywhere_in_a_buffer():
     buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), frames.flatten()])
     shifted = FrameCodec.compress(buffer[3:].view_as(frames), 8)[1]
     assert torch.equal(shifted, FrameCodec.compress(frames, 8)[1])
-
-
-def test_pieces_may_be_written_to_again_when_they_were_given():
-    def pieces():
-        piece = torch.empty(4, 3, 30, 30, dtype=torch.uint8)  # no tile divides it
-        for number in range(3):
-            yield piece.fill_(number)
-
-    codec, codes = FrameCodec.compress(pieces())
-    assert codec.tiles is None and codes[:, 0, 0, 0].tolist() == [0] * 4 + [1] * 4 + [2] * 4

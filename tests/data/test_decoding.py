@@ -60,18 +60,6 @@ def test_entries_can_be_rows_of_shared_frames(frames):
     assert sorted(seen) == list(range(39))
 
 
-def test_raw_frames_pass_through():
-    noise = torch.randint(256, (12, 3, 20, 20), dtype=torch.uint8)
-    decoder = FrameDecoder(FrameCodec.compress(noise)[0], ["pixels"])
-    assert torch.equal(decoder(TensorDict({"pixels": noise}, [12]))["pixels"], noise)
-
-
-def test_missing_entries_are_named(frames):
-    decoder = FrameDecoder(FrameCodec.compress(frames)[0], ["pixels"])
-    with pytest.raises(KeyError, match="'pixels' not found"):
-        decoder(TensorDict({}, []))
-
-
 def test_samples_follow_the_tables_to_their_device(frames):
     codec, codes = FrameCodec.compress(frames, tile_size=8)
     lookups = Lookup(codes, ["pixels"]), Lookup(torch.arange(40).float(), ["name"])

@@ -6,8 +6,6 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage
-from torchrl.envs import ToTensorImage
 
 from ifo_grounding.data import (
     Demonstrations,
@@ -93,31 +91,6 @@ def test_a_model_reads_the_images_that_it_names(preset):
     with torch.no_grad():
         said = model.eval()(buffer[:])["logits"].argmax(-1)
     assert torch.equal(said, swapped.actions.long())
-
-
-def test_a_buffer_takes_a_transform_and_no_storage():
-    demos = record_demonstrations("move", 20)
-    actions = torch.zeros(demos.transitions, dtype=torch.uint8)
-    scaled = labelled_buffer(demos, actions, transform=ToTensorImage(in_keys=["pixels"]))
-    assert scaled.sample(3)["pixels"].dtype == torch.float32
-    with pytest.raises(UserError, match="leave storage out"):
-        labelled_buffer(demos, actions, storage=LazyTensorStorage(100))
-
-
-@pytest.mark.parametrize(("preset", "tile_size"), [("paper", 8), ("strong", 16), ("strong", None)])
-def test_pixels_are_read_where_tiles_are_no_patches(preset, tile_size, monkeypatch):
-    demos = record_demonstrations("move", 20)
-    shown = demos.frames(torch.arange(demos.n_frames))
-    codec, codes = FrameCodec.compress(shown, tile_size or 8)
-    if tile_size is None:
-        codec, codes = FrameCodec(demos.image_shape), shown
-    again = Demonstrations(
-        codec, codes, demos.lengths, demos.instructions, vocabulary=demos.vocabulary
-    )
-    model = make_inverse(demos, preset, seed=0)
-    monkeypatch.delattr(type(model.module), "from_tiles")
-    report = label_demonstrations(again, model, progress=False).report
-    assert len(report.actions) == demos.transitions
 
 
 def test_samples_are_the_demonstrations_own_transitions(inverse):

@@ -135,7 +135,6 @@ def test_any_path_and_colour_mode_will_do(tmp_path):
     "names",
     [
         [f"{number}.png" for number in range(12)],
-        [f"{number:02d}.png" for number in range(90, 102)],
         [f"cam2-{number}.png" for number in range(0, 60, 5)],
         [f"{number}.{half}.png" for number in range(9, 12) for half in (0, 5)],
         ["start.png", "step 2.png", "step 10.png", "stop.png"],
@@ -177,13 +176,6 @@ def test_the_list_may_have_a_mark_and_any_line_break_in_a_sentence(tmp_path):
     line = '{"episode": "a", "instruction": "go\u2028on"}\r\n'
     (tmp_path / "episodes.jsonl").write_bytes(line.encode("utf-8-sig"))
     assert load_pictures(tmp_path).sentences() == ["go on"]
-
-
-def test_suffixes_may_be_in_any_case(demos, tmp_path):
-    save_pictures(demos[:3], tmp_path / "shown")
-    for number, path in enumerate((tmp_path / "shown").rglob("*.png")):
-        path.rename(path.with_suffix((".PNG", ".Png", ".png")[number % 3]))
-    assert torch.equal(load_pictures(tmp_path / "shown").lengths, demos[:3].lengths)
 
 
 def picture(path, value, size=(24, 16), mode="RGB"):
@@ -245,11 +237,8 @@ def deep(folder):
             "jsonl does not exist: write one",
         ),
         (lambda f: (f / "episodes.jsonl").write_text("\n"), "lists no episode"),
-        (lambda f: (f / "episodes.jsonl").write_text("go"), "line 1: a line is a JSON object"),
         (lambda f: (f / "episodes.jsonl").write_text('["a"]'), "line 1: a line is a JSON object"),
-        (lambda f: write(f, [("a", " ", [0, 1])]), "episode 'a' has no instruction"),
         (lambda f: write(f, [("a", "go", [0]), ("b", None, [0])]), "'b' has no .*found None"),
-        (lambda f: write(f, [("a", ["go", "on"], [0])]), "'a' has no .*found a list of 2"),
         (
             lambda f: (f / "episodes.jsonl").write_bytes("{é}".encode("latin-1")),
             r"episodes\.jsonl cannot be read .*: save it as UTF-8",
@@ -257,7 +246,6 @@ def deep(folder):
         (lambda f: write(f, [("a", "go", [0, 1])] * 2), "lists episode 'a' 2 times"),
         (lambda f: write(f, [("a", "go", [0, 1]), ("c", "go", [])]), "episode 'c' has no frames"),
         (lambda f: keep(f, ".npy"), "episode 'b' has no frames: .* but .npy"),
-        (lambda f: keep(f, ""), "episode 'b' has no frames"),
         (lambda f: beside(f, "b.npy"), "episode 'b': .*b.npy is of a kind that is not read: give"),
         (lambda f: beside(f, "b.webp", "b.gif"), "episode 'b': .*b.gif cannot be read"),
         (pipe, r"episode 'b': .*1\.png cannot be read .*no regular file"),
@@ -285,7 +273,7 @@ def test_what_is_there_is_not_replaced(demos, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def film(path, frames=20, size=(32, 16), codec="libx264"):
+def make_video(path, frames=20, size=(32, 16), codec="libx264"):
     """Make a video of plain frames, four a second."""
     with av.open(path, "w") as video:
         stream = video.add_stream(codec, rate=4, options={"g": "5", "bf": "0"})
@@ -300,7 +288,7 @@ def film(path, frames=20, size=(32, 16), codec="libx264"):
 
 @pytest.mark.parametrize("suffix", ["mkv", "avi", "mov"])
 def test_videos_of_other_kinds_are_whole_or_refused(suffix, tmp_path):
-    path = film(tmp_path / f"a.{suffix}", codec="mpeg4" if suffix == "avi" else "libx264")
+    path = make_video(tmp_path / f"a.{suffix}", codec="mpeg4" if suffix == "avi" else "libx264")
     assert len(list(read_video(path))) == 20
     content = path.read_bytes()
     path.write_bytes(content[: len(content) * 2 // 3])
@@ -312,7 +300,7 @@ def test_videos_of_other_kinds_are_whole_or_refused(suffix, tmp_path):
     "content", ["ffconcat version 1.0\nfile {}\n", "#EXTM3U\n#EXTINF:1,\n{}\n#EXT-X-ENDLIST\n"]
 )
 def test_a_list_of_other_files_is_no_video(content, tmp_path):
-    other = film(tmp_path / "other.mp4", frames=3)
+    other = make_video(tmp_path / "other.mp4", frames=3)
     (tmp_path / "a.mp4").write_text(content.format(other.name))
     with pytest.raises(UserError, match="cannot be read"):
         list(read_video(tmp_path / "a.mp4"))
@@ -346,7 +334,7 @@ def test_a_recording_that_was_cut_stays_open(tmp_path):
 
 def test_a_video_may_hold_frames_that_are_not_shown(tmp_path):
     """Editors that cut without encoding anew keep what comes before, from a whole frame on."""
-    whole, part = film(tmp_path / "whole.mp4"), tmp_path / "part.mp4"
+    whole, part = make_video(tmp_path / "whole.mp4"), tmp_path / "part.mp4"
     with av.open(whole) as source, av.open(part, "w") as target:
         stream = source.streams.video[0]
         copy = target.add_stream_from_template(stream)
@@ -362,7 +350,7 @@ def test_a_video_may_hold_frames_that_are_not_shown(tmp_path):
 
 
 def test_pictures_and_videos_come_the_right_way_up(tmp_path):
-    path = film(tmp_path / "a.mp4", frames=3)
+    path = make_video(tmp_path / "a.mp4", frames=3)
     content = bytearray(path.read_bytes())
     at = content.index(b"tkhd") + 44  # the matrix by which a player turns the frames
     content[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 16 << 16, 0, 1 << 30)
@@ -396,13 +384,6 @@ def test_a_photo_may_hold_a_preview_and_an_animation_is_no_frame(tmp_path):
     shown[0].save(tmp_path / "a" / "3.webp", save_all=True, append_images=shown[1:])
     with pytest.raises(UserError, match=r"episode 'a': 3\.webp holds 2 pictures"):
         load_pictures(tmp_path)
-
-
-def test_what_stays_the_same_for_long_is_no_gif(tmp_path):
-    still = Demonstrations.from_arrays([np.zeros((3000, 3, 8, 8), np.uint8)], ["stay"])
-    with pytest.raises(UserError, match="episode '0' stays the same for longer than a GIF can say"):
-        save_pictures(still, tmp_path / "shown", kind="gif")
-    assert not list(tmp_path.iterdir())
 
 
 def test_what_has_no_instruction_is_not_written(tmp_path):

@@ -41,20 +41,6 @@ def test_frames_show_the_actions_that_fulfil_the_instruction(task):
         assert (grammar(task).parse(demos.sentences()[number]) == goal).all()
 
 
-def test_same_seed_same_demonstrations():
-    first, second, other = (record_demonstrations("pick", 30, seed=s) for s in (1, 1, 2))
-    assert torch.equal(first.codes, second.codes)
-    assert torch.equal(first.instructions, second.instructions)
-    assert torch.equal(first.codec.tiles, second.codec.tiles)
-    assert not torch.equal(first.instructions, other.instructions)
-
-
-def test_more_demonstrations_begin_with_the_same_ones():
-    few, many = record_demonstrations("move", 5), record_demonstrations("move", 9)
-    assert torch.equal(few.instructions, many.instructions[:5])
-    assert torch.equal(few.first_frames(), many.first_frames()[:5])
-
-
 def test_batches_are_joined_in_order(monkeypatch):
     whole, truth = record_demonstrations("move", 50, keep_truth=True)
     monkeypatch.setattr(recording, "BATCH", 16)

@@ -1,5 +1,4 @@
 import math
-from functools import partial
 
 import pytest
 import torch
@@ -27,10 +26,8 @@ from training.tiny import (
     likes,
     make_env,
     make_networks,
-    make_policy,
     same,
     simulator,
-    tiny,
     weights,
 )
 
@@ -112,7 +109,7 @@ def test_values_are_estimated_some_at_a_time_with_the_same_result(monkeypatch, g
             torch.testing.assert_close(one, whole, atol=1e-5, rtol=1e-3)
 
 
-@pytest.mark.parametrize("make", [make_env, nested, grouped, of_pairs])
+@pytest.mark.parametrize("make", [nested, grouped])
 def test_a_killed_run_continues_to_the_same_weights(tmp_path, make):
     chosen = config(iterations=3, select_every=1, select_episodes=8, max_steps=4)
     whole = make_networks()
@@ -155,29 +152,10 @@ def test_an_interrupted_run_goes_on_with_the_same_objects(tmp_path):
     assert same(weights(*networks), weights(*whole))
 
 
-def test_a_checkpoint_of_other_networks_is_one_line(tmp_path):
-    path = tmp_path / "run.pt"
-    self_examine(make_env(), *make_networks(), config(), seed=0, checkpoint=path)
-    other = make_policy(), tiny(2, keys.STATE_VALUE)
-    with pytest.raises(UserError, match="holds another value than this run has") as error:
-        self_examine(make_env(), *other, config(), seed=0, checkpoint=path)
-    assert "\n" not in str(error.value)
-    with pytest.raises(UserError, match=r"made with lr=0\.0002, not 0\.1"):
-        self_examine(make_env(), *make_networks(), config(lr=0.1), seed=0, checkpoint=path)
-
-
-def test_stored_pairs_are_where_episodes_begin():
-    pairs = select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
-    env = TransformedEnv(simulator(8), Compose(StartingPairs(pairs), LearnedReward(likes(1))))
-    self_examine(env, *make_networks(), config(), seed=0)
-    assert set(env.base_env.scene_numbers.tolist()) <= set(pairs["scene"].flatten().tolist())
-
-
 @pytest.mark.filterwarnings("ignore:A lambda function was passed to ParallelEnv")
-@pytest.mark.parametrize("kind", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
-def test_worlds_may_live_in_workers(kind):
+def test_worlds_may_live_in_workers():
     sampled = Compose(InstructionSampler(accepts_all(), POOL), LearnedReward(likes(1)))
-    env = TransformedEnv(kind(2, lambda: simulator(4)), sampled)
+    env = TransformedEnv(ParallelEnv(2, lambda: simulator(4), mp_start_method="fork"), sampled)
     try:
         chosen = config(select_every=1, select_episodes=12, max_steps=5)
         history = self_examine(env, *make_networks(), chosen, seed=0)
