@@ -18,12 +18,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ifo_grounding.cli import recipes_folder
-from ifo_grounding.config import FEW, FREE, Options, register
+from ifo_grounding.config import FREE, Options, register
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.data.listing import LIST, read_list
 from ifo_grounding.errors import UserError, did_you_mean
 from ifo_grounding.training.run import Run
 
+FEW = 1000
+"""With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
 LARGEST = 2**31 - 1
 """Of whole numbers that are no seeds."""
 CONFIG = "config"
