@@ -123,14 +123,25 @@ def test_every_make_command_is_a_target():
     assert {"demo", "test"} <= named
 
 
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings of a page."""
+    headings = re.findall(r"^#+ (.+)$", FENCE.sub("", page.read_text()), re.MULTILINE)
+    words = (re.sub(r"[^\w\s-]", "", heading.lower()).split() for heading in headings)
+    return {re.sub("-+", "-", "-".join(each)) for each in words}
+
+
 def test_every_local_link_and_picture_exists():
     missing = []
     for page in PAGES:
         text = FENCE.sub("", page.read_text())
-        for target in re.findall(r"\]\(([^)\s#]+)(?:#[^)]*)?\)|src=\"([^\"]+)\"", text):
-            path = "".join(target)
-            if "://" not in path and not (page.parent / path).exists():
-                missing.append(f"{name_of(page)}: {path}")
+        for path, anchor, source in re.findall(
+            r"\]\(([^)\s#]*)(?:#([^)]*))?\)|src=\"([^\"]+)\"", text
+        ):
+            target = page.parent / (path + source) if path + source else page
+            if "://" in path + source:
+                continue
+            if not target.exists() or (anchor and anchor not in anchors(target)):
+                missing.append(f"{name_of(page)}: {path}{source}#{anchor}")
     assert not missing
 
 
