@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from comparing import all_frames, assert_same
-from ifo_grounding.data import Demonstrations, _images, load_pictures, save_pictures
+from ifo_grounding.data import Demonstrations, load_pictures, save_pictures
 from ifo_grounding.data._video import read_video
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
@@ -321,21 +321,6 @@ def test_a_list_of_other_files_is_no_video(content, tmp_path):
         list(read_video(tmp_path / "b.mp4"))
 
 
-def test_a_gif_shows_no_more_frames_than_is_stated(tmp_path, monkeypatch):
-    monkeypatch.setattr(_images, "MOST_FRAMES", 20)
-    first, second = (Image.new("RGB", (24, 16), colour) for colour in ("red", "blue"))
-    first.save(
-        tmp_path / "a.gif",
-        save_all=True,
-        append_images=[second],
-        duration=[10, 200],
-        comment=_images.COMMENT % 10,
-    )
-    list_of(tmp_path, ["a"])
-    with pytest.raises(UserError, match=r"episode 'a': .* \(it shows more than 20 frames"):
-        load_pictures(tmp_path)
-
-
 def test_a_recording_that_was_cut_stays_open(tmp_path):
     write(tmp_path, [("a", "go", [0, 1]), ("b", "go", [0, 1])])
     lines = (tmp_path / "episodes.jsonl").read_text().replace("}", ', "truncated": true}', 1)
@@ -396,13 +381,6 @@ def test_a_photo_may_hold_a_preview_and_an_animation_is_no_frame(tmp_path):
     shown[0].save(tmp_path / "a" / "3.webp", save_all=True, append_images=shown[1:])
     with pytest.raises(UserError, match=r"episode 'a': 3\.webp holds 2 pictures"):
         load_pictures(tmp_path)
-
-
-def test_what_stays_the_same_for_long_is_no_gif(tmp_path):
-    still = Demonstrations.from_arrays([np.zeros((3000, 3, 8, 8), np.uint8)], ["stay"])
-    with pytest.raises(UserError, match="episode '0' stays the same for longer than a GIF can say"):
-        save_pictures(still, tmp_path / "shown", kind="gif")
-    assert not list(tmp_path.iterdir())
 
 
 def test_what_has_no_instruction_is_not_written(tmp_path):
