@@ -154,12 +154,6 @@ def test_a_saved_report_makes_the_buffer_again(tmp_path, inverse):
     assert torch.equal(buffer[:]["action"], report.actions.long())
     with pytest.raises(UserError, match="were they made for these demonstrations"):
         labelled_buffer(demos[:5], loaded.actions)
-    LabelReport(report.actions, report.confidence, 2).save(tmp_path / "labels")
-    with pytest.raises(UserError, match=r"an action outside 0\.\.1"):
-        LabelReport.load(tmp_path / "labels")
-    LabelReport(report.actions, report.confidence[1:], 6).save(tmp_path / "labels")
-    with pytest.raises(UserError, match="not of one length"):
-        LabelReport.load(tmp_path / "labels")
 
 
 @pytest.mark.parametrize(("n_actions", "dtype"), [(256, torch.uint8), (300, torch.int32)])

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from comparing import all_frames, assert_same
-from ifo_grounding.data import Demonstrations, _images, load_pictures, save_pictures
+from ifo_grounding.data import Demonstrations, load_pictures, save_pictures
 from ifo_grounding.data._video import read_video
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
@@ -307,21 +307,6 @@ def test_a_list_of_other_files_is_no_video(content, tmp_path):
     os.mkfifo(tmp_path / "b.mp4")
     with pytest.raises(UserError, match="no regular file"):
         list(read_video(tmp_path / "b.mp4"))
-
-
-def test_a_gif_shows_no_more_frames_than_is_stated(tmp_path, monkeypatch):
-    monkeypatch.setattr(_images, "MOST_FRAMES", 20)
-    first, second = (Image.new("RGB", (24, 16), colour) for colour in ("red", "blue"))
-    first.save(
-        tmp_path / "a.gif",
-        save_all=True,
-        append_images=[second],
-        duration=[10, 200],
-        comment=_images.COMMENT % 10,
-    )
-    list_of(tmp_path, ["a"])
-    with pytest.raises(UserError, match=r"episode 'a': .* \(it shows more than 20 frames"):
-        load_pictures(tmp_path)
 
 
 def test_a_recording_that_was_cut_stays_open(tmp_path):

@@ -12,7 +12,7 @@ from torch import Tensor
 from ifo_grounding import mosaic
 from ifo_grounding.data import _spool
 from ifo_grounding.data._spool import Spool, join
-from ifo_grounding.data._tile_index import TileIndex, cut
+from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
 
 TILE_SIZES = (8, 16, 32, 64)
@@ -52,9 +52,9 @@ class FrameCodec:
         channels, height, width = (int(side) for side in image_shape)
         self.image_shape = (channels, height, width)
         self.tile_size: int | None = None
-        self._index: TileIndex | None = None
+        self._index: _TileIndex | None = None
         if tiles is not None:
-            self._index = TileIndex(mosaic.words(tiles.cpu()).flatten(1))
+            self._index = _TileIndex(mosaic.words(tiles.cpu()).flatten(1))
             side = self.tile_size = int(tiles.shape[-1])
             if tiles.shape[1:] != (channels, side, side) or height % side or width % side:
                 raise UserError(
@@ -164,7 +164,7 @@ class FrameCodec:
         used = torch.zeros(len(tiles), dtype=torch.bool)
         for piece in given.split(PIECE_FRAMES):
             used[piece.flatten().long()] = True
-        distinct = TileIndex(torch.empty(0, tiles[0].numel() // mosaic.PIXELS_PER_WORD).long())
+        distinct = _TileIndex(torch.empty(0, tiles[0].numel() // mosaic.PIXELS_PER_WORD).long())
         numbers = torch.zeros(len(tiles), dtype=torch.int64)
         numbers[used] = distinct.add(mosaic.words(tiles[used]).flatten(1))
         order = torch.randperm(len(distinct), generator=generator)
@@ -216,7 +216,7 @@ class FrameCodec:
         parts = []
         frames = frames.cpu().reshape(-1, *self.image_shape)  # strides as words need them
         for piece in frames.split(max(1, CHUNK_BYTES // math.prod(self.image_shape))):
-            numbers = self._index.add(cut(piece, self.tile_size))
+            numbers = self._index.add(_cut(piece, self.tile_size))
             parts.append(numbers.to(self.code_dtype))
         return join(parts, self.code_dtype).view(-1, *self.code_shape)
 
@@ -242,6 +242,50 @@ class FrameCodec:
     def _give_up(self, codes: Spool) -> tuple[FrameCodec, Spool]:
         """Turn codes back into pixels and return them with a raw codec."""
         return FrameCodec(self.image_shape), codes.map(self.decode)
+
+
+def _cut(frames: Tensor, tile_size: int) -> Tensor:
+    """Cut frames, uint8 [F, C, H, W], into tiles as words, int64 [F * rows * columns, K]."""
+    count, channels, height, width = frames.shape
+    words = mosaic.as_words(frames)
+    across = tile_size // mosaic.PIXELS_PER_WORD
+    grid = (count, channels, height // tile_size, tile_size, width // tile_size, across)
+    return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)
+
+
+class _TileIndex:
+    """Distinct rows of words and their numbers, in the order in which they were added.
+
+    Args:
+        words: distinct rows, int64 [N, K].
+
+    Raises:
+        UserError: where a row comes twice.
+    """
+
+    def __init__(self, words: Tensor) -> None:
+        self.words = words
+        self._numbers = {row.tobytes(): number for number, row in enumerate(words.numpy())}
+        if len(self._numbers) != len(words):
+            raise UserError("tiles are not distinct: give each tile once")
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    def add(self, rows: Tensor) -> Tensor:
+        """Return the numbers of ``rows`` [M, K], int64 [M], adding those that are new."""
+        distinct, index = distinct_rows(rows)
+        known = len(self)
+        numbers = torch.tensor(
+            [
+                self._numbers.setdefault(row.tobytes(), len(self._numbers))
+                for row in distinct.numpy()
+            ],
+            dtype=torch.int64,
+        )
+        if len(self._numbers) > known:
+            self.words = torch.cat([self.words, distinct[numbers >= known]])
+        return numbers[index]
 
 
 def smallest_dtype(count: int) -> torch.dtype:

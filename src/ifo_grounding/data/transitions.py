@@ -134,12 +134,7 @@ class Collected(NamedTuple):
         codes, after, action, taken, kept = (arrays[name] for name in names)
         with damaged(folder):
             codec = FrameCodec(facts["image_shape"], arrays.get("tiles"))
-            codec.check(codes)
-            codec.check(after)
-            if not len(action) or len(action.bincount(minlength=len(taken))) > len(taken):
-                raise UserError("it holds no actions, or unknown ones")
-            report = TransitionReport(taken, kept)
-            return cls(_buffer(codec, codes, action, after, options), report)
+            return cls(_buffer(codec, codes, action, after, options), TransitionReport(taken, kept))
 
 
 def _buffer(
