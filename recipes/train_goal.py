@@ -16,7 +16,7 @@ def train_goal(options: Options) -> dict:
     demos = load_demonstrations(stage.run)
     policy = starting_policy(stage.run, options, section.warm_start)
     loss = GoalLoss(
-        build(make_goal_classifier, options, init_from=policy, context=section.context),
+        build(make_goal_classifier, options, init_from=policy),
         demos.pool(),
         negatives=section.negatives,
         removal_rate=section.removal_rate,

@@ -157,15 +157,12 @@ class GoalConfig(FitConfig):
     """Share of the negatives that differ from the demonstration's instruction in few words."""
     removal_rate: float | None = 0.0
     """Share of the negatives that is taken for fulfilled; null estimates it."""
-    context: int = 0
-    """How many neighbouring cells away the classifier sees."""
     warm_start: bool = True
     """Begin with the weights of the phase-1 policy."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, "negatives", least=1)
-        check_range(self, "context", least=0)
         check_range(self, "near", "removal_rate", least=0, most=0.999)
 
 

@@ -12,7 +12,7 @@ from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
 from ifo_grounding.worlds import Grid
 
-TURN = ["goal.context=0", "imitate.context=0", "demonstrations.n=60", "task=dial"]
+TURN = ["imitate.context=0", "demonstrations.n=60", "task=dial"]
 DIAL = '''
 """A world outside the package: a dial with six marks on an image of 20 x 28 pixels."""
 import gymnasium
