@@ -47,7 +47,7 @@ types: $(DEV) ## type check
 	$(BIN)/mypy
 
 docs: $(DEV) ## build the documentation into site/, warnings are errors
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 format: $(DEV) ## format and fix what can be fixed
 	$(BIN)/ruff check --fix

@@ -11,7 +11,8 @@ from pages import write
 from ifo_grounding import networks
 from ifo_grounding.evaluation import record_episodes
 from ifo_grounding.files import read_json
-from ifo_grounding.report import Case, animation, gallery
+from ifo_grounding.report import Captioned, animation, gallery
+from ifo_grounding.report.theme import GOOD
 from ifo_grounding.tasks import TASKS, VOCABULARY, SceneOptions, SceneStream
 from ifo_grounding.training import Run
 from ifo_grounding.world import render
@@ -26,7 +27,7 @@ def world() -> bytes:
         scene = stream.scenes(torch.tensor([3 * number]))
         (sentence,) = VOCABULARY.decode(scene.instruction)
         picture = render(scene.state, tile_size=32)[0].numpy()
-        cases.append(Case(picture, sentence, good=True, note=task))
+        cases.append(Captioned(picture, sentence, note=task, colour=GOOD))
     return gallery(cases, columns=len(cases))
 
 

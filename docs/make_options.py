@@ -1,56 +1,58 @@
 """Write the page of all options: ``python docs/make_options.py`` after one has changed."""
 
-import dataclasses
 import inspect
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 from ifo_grounding.config import Options
 from ifo_grounding.files import atomic_write
 from ifo_grounding.options import field_docs, options_of
+from ifo_grounding.training import FitConfig
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
 PAGE = Path(__file__).with_name("options.md")
 HEAD = """# Options
 
-Written `name=value` on the command line, those of a section `section.name=value`. Values are those of
-`demo` with the presets `strong` and `paper`; `ifo-grounding demo preset=paper budget=full --help`
-shows those of any choice. Nothing else is an option: a name, a type or a value out of range that
-is not here is refused before anything begins.
+Written `name=value`, as [Recipes](recipes.md#options) shows. Values are those of `budget=demo`,
+`strong` / `paper` where these presets differ; `ifo-grounding demo budget=few --help` shows others.
 """
+SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
+WORLDS = {"world=grid": Grid, "world=babyai": BabyAI, "world=gymnasium": Gymnasium}
+FITTED = [name for name, kind in SECTIONS.items() if issubclass(kind, FitConfig)]
 
 
 def page() -> str:
     """Return the page as Markdown."""
-    strong, paper = options_of(), options_of("preset=paper")
-    fields = {field.name: field for field in dataclasses.fields(Options)}
-    sections = {n: f for n, f in fields.items() if dataclasses.is_dataclass(f.default_factory)}
-    plain = [name for name in fields if name not in sections and name != "world"]
-    parts = [HEAD, "## Of all\n", table(Options, plain, strong, paper)]
-    for name, field in sections.items():
-        kind = field.default_factory
-        parts.append(f"## {name}\n\n{inspect.getdoc(kind)}\n")
-        names = [each.name for each in dataclasses.fields(kind)]
-        parts.append(table(kind, names, getattr(strong, name), getattr(paper, name)))
-    for kind in (Grid, BabyAI, Gymnasium):
-        parts.append(f"## world={kind.__name__.lower()}\n\n{summary(kind)}\n")
-        docs = field_docs(kind)
-        rows = [(f"world.{n}", docs[n]) for n in (f.name for f in dataclasses.fields(kind))]
-        lines = ["| option | meaning |", "| --- | --- |", *(f"| `{n}` | {d} |" for n, d in rows)]
-        parts.append("\n".join(lines) + "\n")
+    composed = (options_of(f"preset={name}") for name in ("strong", "paper"))
+    presets = [replace(each, run=Options.run) for each in composed]
+    values = {name: [getattr(each, name) for each in presets] for name in SECTIONS}
+    general = [f.name for f in fields(Options) if f.name not in (*SECTIONS, "world")]
+    learning = [*field_docs(FitConfig)]
+    said = f"Each in {', '.join(f'`{name}`' for name in FITTED)}, such as `imitate.lr`."
+    parts = [HEAD, "## General\n", table(Options, general, "", value=presets)]
+    parts += [f"## How networks learn\n\n{said}\n"]
+    parts += [table(FitConfig, learning, "", **{name: values[name] for name in FITTED})]
+    for name, kind in {**SECTIONS, **WORLDS}.items():
+        shown = values.get(name) or [SimpleNamespace(**options_of(name).world)]
+        if own := [n for n in field_docs(kind) if name not in FITTED or n not in learning]:
+            said = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("``", "`")
+            parts += [f"## {name}\n\n{said}\n"]
+            parts += [table(kind, own, f"{name.partition('=')[0]}.", value=shown)]
     return "\n".join(parts)
 
 
-def summary(kind: type) -> str:
-    return " ".join((inspect.getdoc(kind) or "").partition("\n\n")[0].split())
+def table(kind: type, names: list[str], above: str, **columns: list) -> str:
+    docs, head = field_docs(kind), ["option", *columns, "meaning"]
+    rows = [[f"`{above}{n}`", *(shown(v, n) for v in columns.values()), docs[n]] for n in names]
+    lines = (" | ".join(row) for row in [head, ["---"] * len(head), *rows])
+    return "".join(f"| {line} |\n" for line in lines)
 
 
-def table(kind: type, names: list[str], strong: object, paper: object) -> str:
-    docs = field_docs(kind)
-    lines = ["| option | `strong` | `paper` | meaning |", "| --- | --- | --- | --- |"]
-    for name in names:
-        values = [f"`{getattr(each, name)}`".replace("None", "null") for each in (strong, paper)]
-        lines.append(f"| `{name}` | {values[0]} | {values[1]} | {docs[name]} |")
-    return "\n".join(lines) + "\n"
+def shown(values: list, name: str) -> str:
+    texts = dict.fromkeys(str(getattr(each, name)) for each in values)
+    words = {"None": "null", "True": "true", "False": "false"}
+    return " / ".join(f"`{words.get(text, text)}`" for text in texts)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,8 @@ FAILURES = ("stuck", "wrong object", "wrong place", "nothing done")
 @cache
 def pieces() -> dict[tuple[str, str, str], Runs]:
     """Return what the paper's tables are made from, by task, preset and phase."""
-    return read("tables", lambda o: (o["task"], o["network"], o["variant"]))
+    # Options of files from before the two presets name the networks.
+    return read("tables", lambda o: (o["task"], o.get("preset") or o["network"], o["variant"]))
 
 
 def of_paper(percentage: float) -> Rate:

@@ -27,7 +27,6 @@ from ifo_grounding.report import (
     audit_figure,
     reliability_diagram,
     results_rows,
-    success_over_iterations,
     trace_animation,
     training_curves,
     write_report,
@@ -148,15 +147,6 @@ def curves(run: Run) -> dict[str, Any]:
         )
         if stage == "self_examine":
             found["Audit of self-examination (validation scenes)"] = audit_figure(history)
-        audited = [row for row in history if row.get("success") is not None]
-        if len(audited) > 1:
-            found["Success in training (validation scenes)"] = success_over_iterations(
-                [row["step"] for row in audited],
-                [
-                    Rate(row["success"], row["success_low"], row["success_high"], 0, 0)
-                    for row in audited
-                ],
-            )
     return found
 
 

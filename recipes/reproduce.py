@@ -157,7 +157,7 @@ def piece(
 def of_level(options: ReproduceOptions, level: str, n: int, seed: int) -> Piece:
     """Return the piece of one level of BabyAI."""
     preset = options.level["preset"]
-    chosen = [
+    chosen: list[Mapping[str, Any]] = [
         {"world": "babyai", "level": level, "seed": seed, "demonstrations": {"n": n}},
         options.level,
     ]

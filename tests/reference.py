@@ -135,7 +135,7 @@ def apart(one: Cell, other: Cell) -> int:
     return abs(one[0] - other[0]) + abs(one[1] - other[1])
 
 
-def judge(world: Plain, wish: Wish, max_steps: int = 40) -> str:
+def verdict_of(world: Plain, wish: Wish, max_steps: int = 40) -> str:
     """``suitable``, or the first reason why not."""
     try:
         place, destination = resolve(world, wish)

@@ -57,9 +57,9 @@ def test_transforms_collect_on_a_gpu():
     with pretended_gpu():
         env = PickAndPlaceEnv("pick", num_envs=8, seed=0, device="cuda", instructed=False)
         classifier = make_instruction_classifier(demos, device="cuda", seed=0)
-        judge = make_reward_model(demos, device="cuda", seed=0)
+        model = make_reward_model(demos, device="cuda", seed=0)
         chooser = InstructionSampler(classifier, demos.pool(), threshold=0.0)
-        env = TransformedEnv(env, Compose(chooser, LearnedReward(judge)))
+        env = TransformedEnv(env, Compose(chooser, LearnedReward(model)))
         policy = make_policy(demos, device="cuda", seed=0)
         for batch in Collector(env, policy, frames_per_batch=64, total_frames=64, device="cuda"):
             assert batch["next", "learned_reward"].is_cuda

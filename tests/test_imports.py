@@ -163,24 +163,6 @@ def test_the_world_does_not_need_torchrl():
     assert "torch" in roots
 
 
-def test_the_reader_of_imports_sees_every_form(tmp_path, monkeypatch):
-    monkeypatch.setitem(globals(), "PACKAGE", tmp_path)
-    path = tmp_path / "networks" / "sample.py"
-    path.parent.mkdir()
-    path.write_text(
-        "import ifo_grounding.world\n"
-        "from ifo_grounding import evaluation\n"
-        "def late():\n    from ..tasks.goals import achieved\n"
-        "from . import heads\n"
-    )
-    assert imports_of(path) == {
-        "ifo_grounding.world",
-        "ifo_grounding.evaluation",
-        "ifo_grounding.tasks.goals.achieved",
-        "ifo_grounding.networks.heads",
-    }
-
-
 def modules() -> list[str]:
     names = []
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf, open_dict
 
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
+from ifo_grounding.machine import check_device
 from ifo_grounding.seeding import STREAMS
 from ifo_grounding.training.run import LOGGERS
 from ifo_grounding.training.self_examination import SelfExaminationConfig
@@ -36,10 +36,7 @@ FREE = (
     *("run", "base", "until", "results", "variant", "to", "hub", "controls.run", "references"),
     *("device", "threads", "logger", "progress", "checkpoint_seconds", "evaluate"),
 )
-"""Options, or sections of them, that decide nothing of what a run learns: they may be others when
-it goes on."""
-FEW = 1000
-"""With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
+"""Options, or sections, that decide nothing of what a run learns: they may change as it goes on."""
 
 
 @dataclass
@@ -247,8 +244,7 @@ class NetworksConfig:
     sentence_rate: float | None = None
     """How fast the GRU and the gates learn, by the rest (``paper``)."""
     sentence_pooling: str | None = None
-    """Which states of the GRU make an encoded sentence: ``last``, ``mean`` or ``both``
-    (``paper``)."""
+    """States of the GRU that make an encoded sentence: ``mean`` or ``last`` (``paper``)."""
 
     def changed(self) -> dict[str, Any]:
         """Return the values that are not the preset's."""
@@ -321,18 +317,6 @@ class Options:
         if set("/\\\0") & set(self.variant or ""):
             raise UserError(f"variant is part of a file's name, without slashes: {self.variant!r}")
         check_device(self.device)
-
-
-def check_device(name: str) -> None:
-    """Raise :class:`UserError` unless networks can be on a device of this name here."""
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = torch.device("meta")
-    if device.type not in ("cpu", "cuda"):
-        raise UserError(f"device={name} is none: use cpu, cuda or cuda:0")
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"device={name}: torch sees no GPU here; use device=cpu")
 
 
 def register() -> None:

@@ -1,4 +1,4 @@
-"""What computes: the name of a processor or of a GPU."""
+"""What computes: whether a device is there, the name of a processor or of a GPU."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import platform
 from pathlib import Path
 
 import torch
+
+from ifo_grounding.errors import UserError
 
 
 def machine_of(device: torch.device | str) -> str:
@@ -26,3 +28,15 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def check_device(device: torch.device | str) -> None:
+    """Raise :class:`UserError` unless networks can be on a device here."""
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        kind = "unknown"
+    if kind not in ("cpu", "cuda"):
+        raise UserError(f"device={device} is none: use cpu, cuda or cuda:0")
+    if kind == "cuda" and (torch.device(device).index or 0) >= torch.cuda.device_count():
+        raise UserError(f"device={device}: torch sees no such GPU here; use device=cpu")

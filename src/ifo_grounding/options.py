@@ -18,12 +18,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ifo_grounding.cli import recipes_folder
-from ifo_grounding.config import FEW, FREE, Options, register
+from ifo_grounding.config import FREE, Options, register
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.data.listing import LIST, read_list
 from ifo_grounding.errors import UserError, did_you_mean
 from ifo_grounding.training.run import Run
 
+FEW = 1000
+"""With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
 LARGEST = 2**31 - 1
 """Of whole numbers that are no seeds."""
 CONFIG = "config"
@@ -105,10 +107,10 @@ def typed(cfg: DictConfig) -> Options:
     options = {}
     for field in dataclasses.fields(Options):
         value = values[field.name]
-        kind = field.default_factory
+        kind: Any = field.default_factory
         if dataclasses.is_dataclass(kind):
             try:
-                value = kind(**value)
+                value = kind(**value)  # type: ignore[operator]
             except UserError as error:
                 raise UserError(_placed(str(error), field.name)) from None
         options[field.name] = value
@@ -147,7 +149,7 @@ def _refuse_unknown(cfg: DictConfig) -> None:
             raise UserError(f"unknown option {name!r}{did_you_mean(str(name), known)}")
         if name not in cfg:
             raise UserError(f"option {name!r} is needed: do not remove it")
-        kind = known[str(name)].default_factory
+        kind: Any = known[str(name)].default_factory
         if dataclasses.is_dataclass(kind):
             fields = {field.name for field in dataclasses.fields(kind)}
             for wrong in fields.symmetric_difference(map(str, cfg[name])):
@@ -177,7 +179,7 @@ def explained(error: Exception) -> UserError:
 
 def help_text(recipe: str, cfg: DictConfig) -> str:
     """Return all options with their values and what they mean, section by section."""
-    kind = OmegaConf.get_type(cfg)
+    kind: Any = OmegaConf.get_type(cfg)
     lines = [
         f"{recipe}: options are written name=value, those of a section section.name=value.",
         "",
@@ -185,7 +187,7 @@ def help_text(recipe: str, cfg: DictConfig) -> str:
     for group in ("preset", "budget", "world") if kind is Options else ():
         files = (recipes_folder() / "conf" / group).glob("*.yaml")
         lines.append(f"  {group}: {', '.join(sorted(path.stem for path in files))}")
-    return "\n".join([*lines, "", *described(kind, OmegaConf.to_container(cfg))])
+    return "\n".join([*lines, "", *described(kind, plain(cfg))])
 
 
 def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[str]:

@@ -15,7 +15,6 @@ from torchrl.envs import Compose
 
 from ifo_grounding.data import FrameCodec, FrameDecoder
 from ifo_grounding.data.decoding import Lookup
-from ifo_grounding.errors import UserError
 from ifo_grounding.world import random_layout, render
 
 
@@ -59,18 +58,6 @@ def test_entries_can_be_rows_of_shared_frames(frames):
         assert torch.equal(sample["name"], names[sample["row"].long()])
         seen += sample["row"].tolist()
     assert sorted(seen) == list(range(39))
-
-
-def test_raw_frames_pass_through():
-    noise = torch.randint(256, (12, 3, 20, 20), dtype=torch.uint8)
-    decoder = FrameDecoder(FrameCodec.fit(noise), ["pixels"])
-    assert torch.equal(decoder(TensorDict({"pixels": noise}, [12]))["pixels"], noise)
-
-
-def test_missing_entries_are_named(frames):
-    decoder = FrameDecoder(FrameCodec.fit(frames), ["pixels"])
-    with pytest.raises(KeyError, match="'pixels' not found"):
-        decoder(TensorDict({}, []))
 
 
 def test_samples_follow_the_tables_to_their_device(frames):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from comparing import all_frames
-from ifo_grounding.data import Demonstrations, FrameCodec, _episodes, _spool, codec, goal_buffer
+from ifo_grounding.data import Demonstrations, _episodes, _spool, codec, goal_buffer
 from ifo_grounding.data._spool import Spool
 
 SCRIPT = """
@@ -106,12 +106,3 @@ def test_rows_on_disk_take_the_type_of_the_largest(scratch):
     assert rows.untyped_storage().nbytes() == rows.nbytes
     assert rows[:, 3].tolist() == [0] * 500 + [200] * 500 + [300] * 500 + [70_000] * 500
     assert not list(scratch.iterdir())
-
-
-def test_a_dictionary_that_saves_little_is_given_up(monkeypatch):
-    monkeypatch.setattr(codec, "PATIENCE_BYTES", 1)
-    half = torch.randint(256, (30, 3, 32, 32), dtype=torch.uint8)
-    half[:, :, :8] = 0
-    assert FrameCodec.fit(iter([half, half[:0]]), tile_size=8).tiles is None
-    half[:, :, :24] = 0
-    assert FrameCodec.fit(iter([half, half[:0]]), tile_size=8).tiles is not None

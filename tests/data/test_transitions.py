@@ -63,18 +63,12 @@ def test_stops_are_kept_of_workers_in_processes(wrap):
     assert int(report.kept[5]) == int(report.taken[5]) > 0
 
 
-def test_all_actions_are_equally_likely_by_default():
-    _, report = collect_transitions(make_env(), 1200)
-    assert (report.taken - 200).abs().max() < 60  # four and a half standard deviations
-
-
 def test_the_stop_can_be_rare():
     _, report = collect_transitions(make_env(), 1200, stop_probability=0.02)
     assert abs(report.taken[5] - 24) < 20
     assert (report.taken[:5] - 235).abs().max() < 60
     _, report = collect_transitions(make_env(), 100, stop_probability=0.0)
     assert report.taken[5] == 0
-    assert str(report).splitlines()[6].split() == ["5", "0", "0"]
 
 
 def test_same_seeds_same_transitions():
@@ -82,12 +76,6 @@ def test_same_seeds_same_transitions():
     other = collect_transitions(make_env(), 300, seed=5).buffer[:]
     assert (first == second).all()
     assert first.shape != other.shape or not torch.equal(first["action"], other["action"])
-
-
-def test_frames_are_stored_as_codes():
-    buffer, _ = collect_transitions(make_env(), 500)
-    stored = buffer.storage.get(slice(None))
-    assert stored.bytes() * 50 < buffer[:].exclude("index").bytes()
 
 
 @pytest.mark.parametrize("n", [1, 5, 16, 37])
@@ -140,22 +128,6 @@ def test_saved_transitions_are_the_same(tmp_path):
         Demonstrations.load(tmp_path / "t")
     (tmp_path / "t" / "action.npy").unlink()
     with pytest.raises(UserError, match=r"action\.npy is missing"):
-        Collected.load(tmp_path / "t")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda stored: stored["pixels"].fill_(120), "codes hold tile 120"),
-        (lambda stored: stored["action"].fill_(9), "unknown ones"),
-        (lambda stored: stored.set("action", stored["action"].float()), "is damaged"),
-    ],
-)
-def test_saved_nonsense_is_refused(change, message, tmp_path):
-    collected = collect_transitions(make_env(), 50)
-    change(collected.buffer.storage._storage)
-    collected.save(tmp_path / "t")
-    with pytest.raises(UserError, match=message):
         Collected.load(tmp_path / "t")
 
 

@@ -58,7 +58,7 @@ def test_steps_and_rewards_agree_with_the_plain_rules(task):
 
 
 @pytest.mark.parametrize("late", [0, 1])
-def test_success_is_judged_when_time_runs_out(late):
+def test_success_counts_when_time_runs_out(late):
     """The last move of the expert comes as action 40, or one too late."""
     env = PickAndPlaceEnv("pick", 64, seed=0)
     td = env.reset()
@@ -138,7 +138,7 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
             began = env._simulator.stream.scenes(env.scene_numbers)
             assert torch.equal(td["instruction"], began.instruction)
             assert torch.equal(env.truth.wanted.objects, began.wanted.objects)
-        if turn % 2:  # twice, and a step, before anybody looks
+        if turn % 2:  # twice, and a step, before anybody reads
             env._simulator.reset(mask.nonzero().squeeze(-1)[:3])
             env._simulator.step(torch.randint(5, (256,)))
             td.update(env._observe())

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import subprocess
 import sys
 import warnings
 
@@ -11,11 +10,9 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import PPO
-from stable_baselines3.common.env_checker import check_env as check_for_sb3
 from stable_baselines3.common.env_util import make_vec_env
 from torchrl.envs import GymEnv, GymWrapper, check_env_specs
 
-import ifo_grounding
 from ifo_grounding.envs.gymnasium_envs import PickAndPlaceGymEnv, PickAndPlaceVectorEnv
 from ifo_grounding.envs.window import LINE_HEIGHT
 from ifo_grounding.errors import UserError
@@ -24,7 +21,6 @@ from ifo_grounding.world import Layout, render
 
 IDS = dict(zip(("Move", "MoveUDLR", "Pick", "PickOut", "PickUDLR"), TASKS, strict=True))
 NAMES = {task: f"ifo_grounding/{name}-v0" for name, task in IDS.items()}
-UP = 0
 
 
 @pytest.fixture
@@ -45,26 +41,12 @@ def test_the_five_ids_are_registered_on_import():
         assert gymnasium.spec(name).max_episode_steps is None  # the limit is the env's own
 
 
-def test_importing_the_package_is_cheap():
-    code = (
-        "import sys, ifo_grounding as p, gymnasium as g; "
-        "assert 'ifo_grounding/Move-v0' in g.registry; "
-        "sys.exit('torch' in sys.modules or 'pygame' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-    assert ifo_grounding.__version__[0].isdigit()
-
-
 # --- one world -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_checks_pass_without_a_warning(task, no_warnings):
     check_env(gymnasium.make(NAMES[task]).unwrapped)
-
-
-def test_the_checks_of_stable_baselines_pass(no_warnings):
-    check_for_sb3(gymnasium.make(NAMES["pick"]).unwrapped)
 
 
 def test_spaces_and_infos_are_as_described():
@@ -222,8 +204,6 @@ def test_torchrl_wraps_many_worlds():
         ({"task": "fly"}, "unknown task 'fly'"),
         ({"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
         ({"render_mode": "ascii"}, "unknown render mode 'ascii'"),
-        ({"split": "x"}, "unknown split 'x'"),
-        ({"max_steps": 0}, "max_steps must be at least 1"),
     ],
 )
 def test_bad_arguments_are_refused(kind, wrong, said):

@@ -114,24 +114,6 @@ def test_next_step_autoreset_takes_a_step_of_its_own():
     assert envs.step(np.array([STOP, UP, UP]))[2].tolist() == [True, False, False]
 
 
-def test_same_step_autoreset_keeps_the_last_observation():
-    envs = gymnasium.make_vec(NAMES["move"], num_envs=3, autoreset_mode="SameStep")
-    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    first, start = envs.reset(seed=0)
-    fresh, _, terminated, _, infos = envs.step(np.array([UP, STOP, UP]))
-    assert terminated.tolist() == [False, True, False]
-    assert infos["_final_obs"].tolist() == [False, True, False]
-    assert infos["final_obs"][0] is None
-    assert np.array_equal(infos["final_obs"][1]["pixels"], first["pixels"][1])
-    assert infos["final_info"]["is_success"].tolist() == [False, False, False]
-    assert infos["final_info"]["_is_success"].tolist() == [False, True, False]
-    assert infos["final_info"]["instruction_text"][1] == start["instruction_text"][1]
-    stream = PickAndPlaceEnv("move", 4, seed=0).reset()["pixels"].numpy()
-    assert np.array_equal(fresh["pixels"][1], stream[3])
-    assert "is_success" not in infos
-    assert "final_obs" not in envs.step(np.array([UP, UP, UP]))[4]
-
-
 def test_without_autoreset_the_caller_resets():
     envs = gymnasium.make_vec(NAMES["move"], num_envs=3, autoreset_mode=AutoresetMode.DISABLED)
     before, _ = envs.reset(seed=0)

@@ -42,13 +42,6 @@ def test_outcomes_agree_with_the_success_rate(up, random_policy):
     assert [len(episode.actions) for episode in episodes] == lengths.tolist()
 
 
-def test_frames_for_people_are_larger(random_policy):
-    small = record_episodes(random_policy, "move", [0])[0]
-    large = record_episodes(random_policy, "move", [0], render_tile_size=32)[0]
-    assert large.frames.shape[1:] == (3, 192, 192)
-    assert large.sentence == small.sentence
-
-
 def test_scenes_of_a_world_without_numbers_are_the_first_ones(random_policy):
     workers = SerialEnv(2, partial(PickAndPlaceEnv, "move", num_envs=3))
     episodes = record_episodes(random_policy, workers, range(6))

@@ -8,10 +8,8 @@ import math
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.envs import SerialEnv
 
 from ifo_grounding.data import record_demonstrations
-from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import return_correlation, reward_audit
 from ifo_grounding.networks import make_reward_model
@@ -90,10 +88,8 @@ def test_what_does_not_fit_the_demonstrations_is_refused(recorded):
     model = scores_actions(lambda action: action)
     with pytest.raises(UserError, match="these very demonstrations"):
         reward_audit(model, demos[:5], truth)
-    with pytest.raises(UserError, match="of 3 with a name"):
-        reward_audit(model, demos, truth, names="LRS")
-    with pytest.raises(UserError, match="knows 6 actions, not 7"):
-        reward_audit(make_reward_model(demos, "strong", seed=0), demos, truth, names="URDLPSX")
+    with pytest.raises(UserError, match="the model knows 6"):
+        reward_audit(model, demos, truth.actions + 6)
     with pytest.raises(UserError, match="at least 1"):
         reward_audit(model, demos, truth, transitions=0)
 
@@ -135,13 +131,6 @@ def test_arrival_is_paid_once(up):
     pay = goal_reward(sees_changes(), stop_action=None, arrival=0.9)
     audit = return_correlation(up, pay, "move", episodes=40, max_steps=5)
     assert set(audit.returns.round(decimals=5).tolist()) == {0.0, 1.0}
-
-
-def test_worlds_in_workers(random_policy):
-    worlds = SerialEnv(3, lambda: PickAndPlaceEnv("move", num_envs=2, seed=0))
-    pay = goal_reward(sees_changes(), stop_action=5)
-    audit = return_correlation(random_policy, pay, worlds, episodes=8, max_steps=10)
-    assert audit.success.count == 8 and torch.isfinite(audit.returns).all()
 
 
 def test_a_network_is_no_transform(up):

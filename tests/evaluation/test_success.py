@@ -16,7 +16,6 @@ from torchrl.envs import (
     RewardSum,
     SerialEnv,
     StepCounter,
-    TensorDictPrimer,
     TransformedEnv,
 )
 from torchrl.envs.utils import ExplorationType, RandomPolicy, exploration_type
@@ -298,18 +297,6 @@ def test_success_is_seen_from_the_true_reward_where_there_are_others(up):
     renamed = TransformedEnv(paid, RenameTransform(["reward"], ["pay"]))
     with pytest.raises(UserError, match="success is seen from the true reward, named 'reward'"):
         success_rate(up, renamed, episodes=20)
-
-
-def test_a_policy_may_remember():
-    """Two steps up and a stop, counted in an entry that the policy hands on to itself."""
-
-    def count(memory):
-        return torch.where(memory < 2, 0, 5).squeeze(-1), memory + 1
-
-    policy = TensorDictModule(count, ["memory"], ["action", ("next", "memory")])
-    primer = TensorDictPrimer(memory=Unbounded((1,), dtype=torch.int64), expand_specs=True)
-    env = TransformedEnv(PickAndPlaceEnv("move", num_envs=4, seed=0), primer)
-    assert success_rate(policy, env, episodes=10, max_steps=9).lengths.tolist() == [3] * 10
 
 
 def test_numbers_of_numpy_are_numbers(random_policy):

@@ -102,13 +102,6 @@ def test_choosing_at_random_gives_the_base_rate():
     assert result.entropy == pytest.approx(math.log2(12), abs=0.02)
 
 
-def test_wordings_of_one_goal_are_one_goal():
-    pool = [s for s in grammar("pick").sentences if "red circle" in s and "orange" in s]
-    assert len(pool) == 12
-    result = suitable_rate(yes(), "pick", pool, states=50)
-    assert result.entropy == result.most_entropy == 0.0
-
-
 def test_nothing_above_the_threshold():
     result = suitable_rate(always(-9.0), "move", grammar("move").tokens, states=100)
     assert result.served.successes == 0 and result.rate.count == 0
@@ -158,12 +151,6 @@ def test_not_every_state_has_a_suitable_instruction(task, share):
     result = suitable_rate(always(-9.0), task, pool, states=600, pairs_per_state=0)
     assert result.servable.count == 500
     assert result.servable.low - 0.01 < share < result.servable.high + 0.01
-
-
-def test_a_state_is_servable_if_one_instruction_of_the_pool_suits_it():
-    pool = ["move to the red circle", "move to the red circle"]
-    result = suitable_rate(always(-9.0), "move", pool, states=400, pairs_per_state=100)
-    assert result.servable.rate == pytest.approx(result.base_rate.rate)
 
 
 def test_the_reliability_of_pairs_is_that_of_what_was_said():

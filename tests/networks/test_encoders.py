@@ -38,7 +38,7 @@ def test_images_keep_their_contrast_through_the_convolutions_of_a_new_encoder():
     assert 0.3 < sum(powers) / len(powers) < 1.5  # with PyTorch's own initial weights: 0.0005
 
 
-@pytest.mark.parametrize("layers", [2, 3, 4])
+@pytest.mark.parametrize("layers", [2, 4])
 @pytest.mark.parametrize(("height", "width", "channels"), [(6, 6, 3), (5, 8, 1), (7, 7, 6)])
 @pytest.mark.parametrize("zoom", [1, 3])  # enlarged, what the later layers look at repeats too
 def test_conv_encoder_computes_windows_that_repeat_once(layers, height, width, channels, zoom):
@@ -57,27 +57,6 @@ def test_conv_encoder_computes_windows_that_repeat_once(layers, height, width, c
     got = torch.autograd.grad((found * weights).sum(), list(encoder.parameters()))
     for one, other in zip(got, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3)
-
-
-def test_blocks_are_those_of_the_map():
-    where = torch.randint(2, (64, 6, 5))
-    where[:, :3] = 0
-    blocks, which = distinct_blocks(where)
-    cut = nn.functional.pad(where + 1, (1, 1, 1, 1)).unfold(1, 3, 2).unfold(2, 3, 2)
-    assert torch.equal(blocks[which], cut.flatten(3))
-    assert len(blocks.unique(dim=0)) == len(blocks)
-    assert distinct_blocks(torch.arange(360).view(2, 12, 15)) is None
-
-
-def test_windows_are_those_of_the_image():
-    image = tiled(32)
-    windows = distinct_windows(image)
-    padded = nn.functional.pad(image, (3, 0, 3, 0))
-    cut = padded.unfold(2, 7, 4).unfold(3, 7, 4).permute(0, 2, 3, 1, 4, 5)
-    assert torch.equal(windows.pixels[windows.where], cut)
-    row, column = torch.arange(12)[:, None] == 0, torch.arange(12) == 0
-    assert torch.equal(windows.top[windows.where], row.expand(32, 12, 12))
-    assert torch.equal(windows.side[windows.where], column.expand(32, 12, 12))
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,8 @@ from ifo_grounding.networks import NetworkConfig, Shapes
 from networks.conftest import MAKERS, OUTPUTS, inputs
 
 SIZES = [
-    Shapes((3, 48, 48), 40, tile_size=8),
     Shapes((3, 96, 96), 40, tile_size=16),
     Shapes((1, 30, 21), 7, instruction_length=5, n_actions=3),
-    Shapes((3, 80, 80), 11, instruction_length=1, n_actions=9, tile_size=8),
 ]
 
 
@@ -33,7 +31,7 @@ def test_other_images_vocabularies_lengths_and_action_counts_work(kind, preset, 
     assert out.isfinite().all()
 
 
-@pytest.mark.parametrize("batch", [[], [1], [0], [4], [2, 3], [2, 1, 2]], ids=str)
+@pytest.mark.parametrize("batch", [[], [0], [2, 1, 2]], ids=str)
 def test_any_leading_dims_give_what_one_dim_gives(kind, preset, shapes, batch):
     module = MAKERS[kind](shapes, preset, seed=0)
     data = inputs(shapes, batch)
@@ -185,9 +183,10 @@ def test_precision_is_the_callers_unless_it_is_given(kind, preset, shapes):
         assert torch.equal(run(kind, make(precision="fp32"), data)[0], exact)
 
 
-@pytest.mark.parametrize(("precision", "off"), [(torch.float64, 1e-4), (torch.bfloat16, 0.1)])
-@pytest.mark.parametrize("alike", [True, False])  # cells that repeat are seen once
-@pytest.mark.parametrize("image", [torch.uint8, torch.float32])
+@pytest.mark.parametrize(
+    ("precision", "off", "alike", "image"),  # cells that repeat are seen once
+    [(torch.float64, 1e-4, True, torch.uint8), (torch.bfloat16, 0.1, False, torch.float32)],
+)
 def test_networks_of_another_precision_read_all_images(
     kind, preset, shapes, precision, off, alike, image
 ):

@@ -68,7 +68,7 @@ def test_a_missing_file_is_named(tmp_path):
 @pytest.mark.parametrize("device", ["cdua", "xpu"])
 def test_a_device_that_is_not_there_is_no_fault_of_the_file(small, tmp_path, device):
     save(make_policy(small), tmp_path / "a.safetensors")
-    with pytest.raises(UserError, match=f"no network can be built on device '{device}' here"):
+    with pytest.raises(UserError, match=f"device={device} is none: use cpu"):
         load(tmp_path / "a.safetensors", device=device)
 
 
@@ -91,11 +91,6 @@ def test_foreign_files_are_refused(tmp_path):
         UserError, match=r"no network of this version .*network 1'.* train it again"
     ):
         load(path)
-
-
-def test_a_folder_is_refused(tmp_path):
-    with pytest.raises(UserError, match="damaged or no safetensors"):
-        load(tmp_path)
 
 
 def rewrite(path, change):

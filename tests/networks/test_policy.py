@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import ClipPPOLoss, ReinforceLoss
+from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from ifo_grounding.errors import UserError
@@ -71,16 +71,6 @@ def test_vmap_is_refused_with_the_option_that_avoids_it(pair, shapes):
     policy, value = pair
     with pytest.raises(UserError, match="give TorchRL's value estimators deactivate_vmap=True"):
         GAE(gamma=0.99, lmbda=0.95, value_network=value)(rollout(shapes, policy))
-
-
-def test_reinforce(pair, shapes):
-    policy, value = pair
-    loss = ReinforceLoss(policy, value)
-    loss.make_value_estimator(gamma=0.9, deactivate_vmap=True)
-    out = loss(rollout(shapes, policy))
-    (out["loss_actor"] + out["loss_value"]).backward()
-    for network in pair:
-        assert all(p.grad is not None for p in network.parameters())
 
 
 def test_place_matters_to_a_policy(shapes):

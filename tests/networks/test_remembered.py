@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from ifo_grounding.networks import ConvEncoder, PatchEncoder, patches
-from ifo_grounding.networks.patches import distinct_patches, remembered
 from ifo_grounding.world import random_layout, render
 
 
@@ -53,34 +52,12 @@ def test_images_that_change_in_place_are_searched_again(kind, images):
     torch.testing.assert_close(changed[4:], before[4:])
 
 
-def test_another_patch_is_another_question(images):
-    black = torch.zeros_like(images)
-    assert [distinct_patches(black, patch)[1].shape[1] for patch in (16, 8, 24)] == [9, 36, 4]
-
-
 def test_what_inference_mode_finds_is_not_kept_for_training(images):
     encoder = ConvEncoder(3, 8, 4)
     with torch.inference_mode():
         encoder(images)
     encoder(images).sum().backward()  # tensors of inference mode cannot be saved for this
     assert encoder.convolutions[0].weight.grad.abs().sum() > 0
-
-
-def test_images_beyond_a_size_are_not_kept(images, monkeypatch):
-    monkeypatch.setattr(patches, "MOST_REMEMBERED", images.nbytes - 1)
-    asked = []
-    find = remembered(lambda image, number: asked.append(number) or number)
-    find(images, 1), find(images, 1)
-    find(images[1:], 2), find(images[1:], 2)
-    assert asked == [1, 1, 2]
-
-
-def test_bytes_and_words_of_the_same_shape_are_told_apart():
-    find = remembered(lambda image, number: image.shape)
-    words = torch.zeros(2, 3, 8, 8, dtype=torch.uint8)
-    few = torch.zeros(2, 3, 8, 1, dtype=torch.uint8)
-    assert find(words, 1) == words.shape
-    assert find(few, 1) == few.shape
 
 
 @pytest.mark.parametrize("kind", [ConvEncoder, PatchEncoder])

@@ -5,7 +5,6 @@ from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import GRUInstructionEncoder
-from ifo_grounding.networks.sentences import word_tree
 from ifo_grounding.tasks import TASKS, VOCABULARY, grammar
 from pretended_gpu import pretended_gpu
 
@@ -79,10 +78,6 @@ def test_padding_changes_nothing(encoder):
     torch.testing.assert_close(mixed[:1], encoder(tokens))
 
 
-def test_no_rows_give_no_features(encoder):
-    assert encoder(torch.zeros(0, 16, dtype=torch.int64)).shape == (0, 32)
-
-
 @pytest.mark.parametrize("bad", [-1, 40])
 def test_ids_outside_the_vocabulary_are_refused(encoder, bad):
     with pytest.raises(UserError, match=r"knows 0 to 39"):
@@ -123,14 +118,3 @@ def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(ta
 def test_ids_of_padding_between_words_are_words_of_their_own(encoder):
     rows = torch.cartesian_prod(*[torch.arange(3)] * 5)  # any of five may be padding
     torch.testing.assert_close(encoder(rows), encoder._encode_all(rows))
-
-
-def test_a_tree_has_fewer_beginnings_than_words():
-    tokens = grammar("pick-out").tokens.long()
-    lengths = (tokens != 0).sum(1)
-    steps, ends = word_tree(tokens, lengths)
-    assert len(ends.unique()) == len(tokens)
-    for length, (words, _) in enumerate(steps, start=1):
-        longer = tokens[lengths >= length, :length]
-        assert len(words) == len(longer.unique(dim=0))
-    assert sum(len(words) for words, _ in steps) < int(lengths.sum()) / 4

@@ -12,7 +12,7 @@ from torchrl.data import (
     OneHot,
     Unbounded,
 )
-from torchrl.envs import ParallelEnv, RenameTransform, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import ParallelEnv, RenameTransform, StepCounter, TransformedEnv
 
 from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -75,27 +75,6 @@ def test_an_env_without_instructions_says_its_vocabulary():
         Shapes.of(source)
 
 
-def test_an_unbounded_vocabulary_is_refused():
-    source = env(Unbounded((5, 12), dtype=torch.int64), Categorical(4, shape=(5,)))
-    with pytest.raises(UserError, match="cannot read vocabulary_size"):
-        Shapes.of(source)
-
-
-def test_a_dataset_is_read_by_its_attributes():
-    dataset = SimpleNamespace(image_shape=[3, 48, 48], vocabulary_size=40, tile_size=8)
-    assert Shapes.of(dataset) == Shapes((3, 48, 48), 40, tile_size=8)
-
-
-def test_nested_keys_are_found():
-    inner = env(INSTRUCTIONS["bounded"], Categorical(4, shape=(5,)))
-    source = SimpleNamespace(
-        observation_spec=Composite(agent=inner.observation_spec, shape=(5,)),
-        full_action_spec=Composite(agent=inner.full_action_spec, shape=(5,)),
-    )
-    names = {name: ("agent", name) for name in ("pixels", "instruction", "action")}
-    assert Shapes.of(source, **names) == Shapes((3, 40, 56), 23, 12, 4)
-
-
 @pytest.mark.parametrize("bad", [{"image_shape": (3, 8)}, {"vocabulary_size": 0}])
 def test_impossible_sizes_are_refused(bad):
     with pytest.raises(UserError, match=next(iter(bad))):
@@ -118,14 +97,6 @@ def test_the_real_env_says_it_all(instructed, wrap):
     assert Shapes.of(wrap(env)) == Shapes((3, 96, 96), len(VOCABULARY), tile_size=16)
 
 
-def test_a_vector_of_envs_says_what_its_specs_say():
-    env = SerialEnv(2, lambda: PickAndPlaceEnv("move", num_envs=2))
-    assert Shapes.of(env).image_shape == (3, 48, 48)
-    assert Shapes.of(env).vocabulary_size == len(VOCABULARY)
-    bare = SerialEnv(2, lambda: PickAndPlaceEnv("move", num_envs=2, instructed=False))
-    assert Shapes.of(bare) == Shapes.of(PickAndPlaceEnv("move", num_envs=2))  # asked, it starts
-
-
 @pytest.mark.parametrize("wrap", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
 def test_workers_in_processes_are_asked(wrap):
     worker = partial(PickAndPlaceEnv, "move", num_envs=2, instructed=False)
@@ -139,19 +110,6 @@ def test_one_hot_actions_are_refused():
     env.action_spec = OneHot(6, shape=(2, 6))
     with pytest.raises(UserError, match="categorical_action_encoding=True"):
         make_policy(env)
-
-
-def test_a_policy_acts_in_the_real_env():
-    env = PickAndPlaceEnv("move", num_envs=3, seed=0)
-    out = env.rollout(4, make_policy(env, seed=0), break_when_any_done=False)
-    assert out.shape == (3, 4)
-    assert out["action_log_prob"].shape == (3, 4)
-
-
-def test_sizes_of_images_may_be_a_list():
-    """As options and JSON give them."""
-    shapes = Shapes(image_shape=[3, 48, 48], vocabulary_size=40)
-    assert shapes == Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
 
 
 @pytest.mark.parametrize(
@@ -172,11 +130,6 @@ def test_actions_that_are_no_number_of_a_choice_are_refused(action):
         Shapes.of(source)
     source.n_actions = 4  # of an environment that says so itself
     assert Shapes.of(source).n_actions == 4
-
-
-def test_bounded_whole_numbers_are_a_choice():
-    action = Bounded(0, 3, (5,), dtype=torch.int64)
-    assert Shapes.of(env(INSTRUCTIONS["categorical"], action)).n_actions == 4
 
 
 def test_images_whose_channels_come_last_are_refused():

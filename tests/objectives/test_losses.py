@@ -228,19 +228,6 @@ def test_a_mixture_drops_nothing_however_many_are_suitable():
     assert float(losses[1]["removed"]) == 0
 
 
-def test_halves_and_whole_networks_give_the_same_loss():
-    loss = make_loss("instruction", removal_rate=0.3)
-    whole = TensorDictModule(
-        loss.network.module.forward, in_keys=["pixels", "instruction"], out_keys=["suitability"]
-    )
-    data = batch()
-    torch.manual_seed(0)
-    expected = loss(data)
-    torch.manual_seed(0)
-    other = InstructionLoss(whole, POOL, removal_rate=0.3)
-    torch.testing.assert_close(other(data).to_dict(), expected.to_dict())
-
-
 def test_images_are_encoded_once_whatever_the_number_of_negatives():
     loss = make_loss("instruction", negatives=11)
     rows = []
@@ -358,19 +345,6 @@ def test_calibration_turns_balanced_odds_into_those_of_random_pairs():
     torch.testing.assert_close(after, before - math.log(3))
     with pytest.raises(UserError, match="removal_rate=None"):
         InstructionLoss(classifier, pool, removal_rate=0.3).calibrate()
-    mixture = InstructionLoss(classifier, pool, unlabelled="mixture")
-    mixture.negatives.watch(torch.ones(1000), torch.cat([torch.ones(250), -torch.ones(750)]))
-    assert mixture.calibrate() == pytest.approx(0.25)
-    torch.testing.assert_close(
-        classifier(pixels=image, instruction=words).sigmoid(), 0.25 * before.exp()
-    )
-
-
-def test_a_look_at_held_out_demonstrations_teaches_no_share():
-    loss = make_loss("instruction")
-    before = {name: value.clone() for name, value in loss.state_dict().items()}
-    loss.eval()(batch())
-    assert all(torch.equal(before[name], value) for name, value in loss.state_dict().items())
 
 
 @pytest.mark.parametrize("preset", ["paper", "strong"])

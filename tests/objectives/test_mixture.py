@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from ifo_grounding.errors import UserError
 from ifo_grounding.objectives.mixture import MixtureEstimate, best_bin_estimate
 from ifo_grounding.objectives.pairs import MOST_REMOVED, NegativeInstructions
 
@@ -31,23 +30,6 @@ def test_the_oldest_scores_are_forgotten():
     estimate.add(torch.ones(10), -torch.ones(10))
     assert estimate.share() == 0.0
     assert estimate.count.tolist() == [18, 18]
-
-
-def test_scores_travel_with_the_state():
-    estimate, other = MixtureEstimate(size=10), MixtureEstimate(size=10)
-    estimate.add(torch.ones(4), torch.tensor([1.0, -1.0, -1.0, -1.0]))
-    other.load_state_dict(estimate.state_dict())
-    assert other.share() == estimate.share() == 0.25
-
-
-def test_the_estimated_share_is_removed_after_the_warm_up():
-    negatives = NegativeInstructions(POOL, None, warmup=0.5)
-    scores = torch.tensor([3.0, -1.0, -2.0, -3.0])
-    negatives.watch(torch.full((4,), 3.0), scores)
-    negatives.progress = 0.4
-    assert negatives.keep(scores).all()
-    negatives.progress = 0.6
-    assert negatives.keep(scores).tolist() == [False, True, True, True]
 
 
 def scored(share: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -102,11 +84,6 @@ def test_the_bound_of_removal_travels_with_the_state_and_no_look_moves_it():
     other.load_state_dict(negatives.state_dict())
     other.watch(*scored(1 / 4))
     assert other.removal_rate == 1 / 8
-
-
-def test_a_share_that_is_given_cannot_be_asked_for():
-    with pytest.raises(UserError, match="removal_rate=None"):
-        NegativeInstructions(POOL, 0.3).suitable_share()
 
 
 def test_an_untrained_classifier_does_not_remove_nearly_all():

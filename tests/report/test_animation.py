@@ -12,13 +12,12 @@ from PIL import Image
 from tensordict.nn import TensorDictModule
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation import Episode, suitable_rate
+from ifo_grounding.evaluation import Episode
 from ifo_grounding.evaluation.tracing import Trace
 from ifo_grounding.report import (
-    Case,
+    Captioned,
     animation,
     gallery,
-    improved_episodes,
     instruction_cases,
     trace_animation,
 )
@@ -100,45 +99,27 @@ def test_animation_refusals():
 
 def test_gallery_marks_the_unsuitable():
     picture = np.zeros((3, 48, 48), np.uint8)
-    cases = [Case(picture, "move", True, "suitable"), Case(picture, "move", False, "missing")]
+    cases = [Captioned(picture, "move", colour=colour) for colour in (GOOD, BAD)]
     sheet = np.asarray(Image.open(io.BytesIO(gallery(cases, width=96)))).astype(int)
     assert near(sheet[PADDING + 1, PADDING + 1], GOOD)
     assert near(sheet[PADDING + 1, 2 * PADDING + 2 * BORDER + 96 + 1], BAD)
-    with pytest.raises(UserError, match="at least one case"):
+    with pytest.raises(UserError, match="at least one picture"):
         gallery([])
 
 
-def test_cases_agree_with_the_suitable_rate():
+def test_cases_show_suitable_and_unsuitable_choices():
     def score(pixels, instruction):
         return torch.full((len(pixels), 1), 3.0)
 
     yes = TensorDictModule(score, ["pixels", "instruction"], ["suitability"])
     pool = grammar("move").tokens
-    rate = suitable_rate(yes, "move", pool, states=200, pairs_per_state=0)
-    cases = instruction_cases(yes, "move", pool, count=200, unsuitable=200, search=200)
-    assert sum(case.good for case in cases) == rate.rate.successes
-    assert len(cases) == 200
-    notes = {case.note for case in cases}
-    assert "suitable (0.95)" in notes and "missing (0.95)" in notes
-    assert all(case.good == case.note.startswith("suitable") for case in cases)
-    assert cases[0].picture.shape == (3, 192, 192)
-    few = instruction_cases(yes, "move", pool, count=12, search=200)
-    assert [case.good for case in few] == [True] * 8 + [False] * 4
+    cases = instruction_cases(yes, "move", pool)
+    assert [case.colour for case in cases] == [GOOD] * 8 + [BAD] * 4
+    assert all(case.note == "suitable (0.95)" for case in cases[:8])
+    assert "missing (0.95)" in {case.note for case in cases}
+    assert cases[0].frame.shape == (3, 192, 192)
     none = instruction_cases(yes, "move", pool, threshold=0.99)
     assert none == []
-
-
-def test_both_policies_play_the_same_scenes():
-    def stop(td):
-        return td.set("action", torch.full(td.shape, 5))
-
-    def up(td):
-        return td.set("action", torch.zeros(td.shape, dtype=torch.int64))
-
-    episodes, titles = improved_episodes(stop, up, "move", [3, 1], max_steps=2)
-    assert titles == ["phase 1", "phase 1", "phase 2", "phase 2"]
-    assert [e.scene for e in episodes] == [3, 1, 3, 1]
-    assert [int(e.actions[0]) for e in episodes] == [5, 5, 0, 0]
 
 
 def test_a_step_is_a_picture_and_a_dollar_sign_no_formula():

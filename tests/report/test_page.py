@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.report import Case, success_over_iterations, write_report
+from ifo_grounding.report import Captioned, training_curves, write_report
 from ifo_grounding.stats import paired_difference, wilson
 
 VOID = {"meta", "img", "source", "br", "link", "input", "hr"}
@@ -55,7 +55,7 @@ def read(page):
 def page(tmp_path):
     """Write a page with every kind of content."""
     picture = np.zeros((3, 48, 48), np.uint8)
-    figure = success_over_iterations([0, 1], [wilson(1, 9), wilson(5, 9)])
+    figure = training_curves([{"step": 0, "loss": 2.0}, {"step": 1, "loss": 1.0}])
     gif = tmp_path / "clip.gif"
     gif.write_bytes(base64.b64decode("R0lGODlhAQABAIAAAAAAAP///ywAAAAAAQABAAACAUwAOw=="))
     results = {
@@ -68,14 +68,12 @@ def page(tmp_path):
     pictures = {
         "Curve": figure,
         "Curve!": figure,
-        "Cases": [Case(picture, "move <here>", False, "missing")],
+        "Cases": [Captioned(picture, "move <here>", note="missing")],
         "No cases": [],
         "Clip": gif,
         "Frame": picture,
     }
-    return write_report(
-        tmp_path / "report", results, pictures, title="A & B", summary="s", notes={"Clip": "<i>"}
-    )
+    return write_report(tmp_path / "report", results, pictures, title="A & B", summary="<i>")
 
 
 def test_it_is_one_page_without_any_outside_source(page):
@@ -130,5 +128,3 @@ def test_refusals(tmp_path):
         write_report(tmp_path, {}, {"Clip": tmp_path / "none.gif"})
     with pytest.raises(UserError, match="PNG, GIF or JPEG"):
         write_report(tmp_path, {}, {"Clip": b"text"})
-    with pytest.raises(UserError, match="no headings"):
-        write_report(tmp_path, {}, notes={"Other": "note"})

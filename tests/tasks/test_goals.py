@@ -78,31 +78,18 @@ OUT = {"object": RED, "source": "pink", "target": "green"}
         ),
         (
             "move-udlr",
-            {"object": RED, "side": "right"},
-            {"objects": {(2, 5): RED}},
-            "out of bounds",
-        ),
-        (
-            "move-udlr",
             {"object": RED, "side": "below"},
             {"objects": {(2, 2): RED, (3, 2): BLUE}},
             "occupied",
         ),
         ("move-udlr", {"object": RED, "side": "left"}, {"objects": {(0, 1): RED}}, "already true"),
         ("pick", PICK, {"objects": {(2, 2): RED}, "boxes": {(4, 4): "green"}}, "suitable"),
-        ("pick", PICK, {"objects": {(2, 2): RED}, "boxes": {(4, 4): "pink"}}, "missing"),
         ("pick", PICK, {"objects": {(4, 4): RED}, "boxes": {(4, 4): "green"}}, "already true"),
         (
             "pick",
             PICK,
             {"objects": {(2, 2): RED, (4, 4): BLUE}, "boxes": {(4, 4): "green"}},
             "occupied",
-        ),
-        (
-            "pick",
-            PICK,
-            {"objects": {(2, 2): RED, (4, 4): RED}, "boxes": {(4, 4): "green"}},
-            "ambiguous",
         ),
         (
             "pick-out",
@@ -137,26 +124,8 @@ OUT = {"object": RED, "source": "pink", "target": "green"}
         (
             "pick-udlr",
             {"object": RED, "reference": BLUE, "side": "above"},
-            {"objects": {(3, 4): RED, (4, 4): BLUE}},
-            "already true",
-        ),
-        (
-            "pick-udlr",
-            {"object": RED, "reference": BLUE, "side": "above"},
             {"objects": {(2, 2): RED, (4, 4): BLUE, (3, 4): YELLOW}},
             "occupied",
-        ),
-        (
-            "pick-udlr",
-            {"object": RED, "reference": BLUE, "side": "below"},
-            {"objects": {(2, 2): RED, (5, 4): BLUE}},
-            "out of bounds",
-        ),
-        (
-            "pick-udlr",
-            {"object": RED, "reference": BLUE, "side": "below"},
-            {"objects": {(2, 2): RED, (3, 4): BLUE, (1, 1): BLUE}},
-            "ambiguous",
         ),
         (  # nothing is beside itself
             "pick-udlr",
@@ -209,21 +178,6 @@ BEGIN = scene(arm=(0, 0), objects={(2, 2): RED, (1, 1): BLUE}, boxes={(4, 4): "g
 def test_success_of_pick_by_hand(arm, objects, held, expected):
     final = scene(arm=arm, objects=objects, boxes={(4, 4): "green"}, held=held)
     assert bool(achieved(BEGIN, final, goal("pick", **PICK))) is expected
-
-
-@pytest.mark.parametrize(
-    ("arm", "objects", "held", "expected"),
-    [
-        ((2, 2), {(2, 2): RED, (1, 1): BLUE}, None, True),
-        ((2, 3), {(2, 2): RED, (1, 1): BLUE}, None, False),
-        ((2, 2), {(1, 1): BLUE}, RED, False),
-        ((2, 3), {(2, 3): RED, (1, 1): BLUE}, None, False),  # the object came to the arm
-        ((2, 2), {(2, 2): RED, (1, 2): BLUE}, None, False),
-    ],
-)
-def test_success_of_move_by_hand(arm, objects, held, expected):
-    final = scene(arm=arm, objects=objects, boxes={(4, 4): "green"}, held=held)
-    assert bool(achieved(BEGIN, final, goal("move", object=RED))) is expected
 
 
 def test_success_needs_an_empty_hand_even_if_it_was_full_before():
@@ -287,7 +241,3 @@ def test_tasks_have_numbers():
     assert [check_task(task) for task in TASKS] == [0, 1, 2, 3, 4]
     with pytest.raises(UserError, match="unknown task 'fly': choose one of 'move'"):
         check_task("fly")
-
-
-def test_the_limit_is_the_paper_s():
-    assert MAX_STEPS == 40

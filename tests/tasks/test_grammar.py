@@ -26,33 +26,14 @@ def test_numbers_of_templates_are_those_of_the_paper():
     assert {task: len(wordings) for task, wordings in PHRASINGS.items()} == WORDINGS
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_each_wording_says_each_goal_in_other_words(task):
-    assert len(grammar(task).sentences) == WORDINGS[task] * FILLERS[task]
-
-
 def test_no_sentence_is_said_twice_by_any_task():
     said = [sentence for task in TASKS for sentence in grammar(task).sentences]
     assert len(said) == len(set(said)) == sum(WORDINGS[task] * FILLERS[task] for task in TASKS)
 
 
-def test_templates_differ_once_their_sides_are_filled_in():
-    """24 = 6 wordings x 4 sides, all different as templates."""
-    for task in TASKS:
-        first = [s for s in grammar(task).sentences if "red circle" in s]
-        assert len(first) == len(set(first)) >= N_TEMPLATES[task]
-
-
 def test_the_vocabulary_holds_every_word_and_no_other():
     used = {word for task in TASKS for s in grammar(task).sentences for word in s.split()}
     assert used == set(VOCABULARY.words)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_sentences_fit_into_an_instruction(task):
-    known = grammar(task)
-    assert known.tokens.shape == (len(known.sentences), 16)
-    assert VOCABULARY.decode(known.tokens) == list(known.sentences)
 
 
 @pytest.mark.parametrize("task", TASKS)

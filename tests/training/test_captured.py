@@ -15,8 +15,13 @@ from ifo_grounding.networks import (
 )
 from ifo_grounding.objectives import ImitationLoss, InstructionLoss, RewardLoss
 from ifo_grounding.training import FitConfig, fit
-from ifo_grounding.training.captured import WARM_UP, CapturedUpdate, let_capture, set_rate
-from ifo_grounding.training.updates import make_optimizer
+from ifo_grounding.training.updates import (
+    WARM_UP,
+    CapturedUpdate,
+    let_capture,
+    make_optimizer,
+    set_rate,
+)
 
 
 def test_an_optimizer_is_captured_or_not_whatever_a_checkpoint_says():

@@ -85,9 +85,3 @@ def test_environments_that_do_not_suit_are_refused():
     del nameless.scene_numbers
     with pytest.raises(UserError, match="needs an environment with scene_numbers"):
         select_pairs(nameless, classifier(), POOL, 5)
-
-
-def test_mode_of_the_classifier_is_left_alone_and_progress_can_be_shown(capsys):
-    network = classifier().train()
-    select_pairs(CounterWorld((4,)), network, POOL, 5, progress=True)
-    assert network.training and "pairs: 100%" in capsys.readouterr().err

@@ -58,19 +58,6 @@ def test_fit_is_a_function_of_its_seed(buffer):
     assert losses[0] == losses[1] != losses[2]
 
 
-def test_a_run_that_paused_goes_on_to_the_same_weights(buffer, tmp_path):
-    config = FitConfig(steps=12, batch_size=32, iteration=3)
-    whole, parts, path = imitation(0.25), imitation(0.25), tmp_path / "run.pt"
-    expected = fit(whole, buffer, config, seed=0)
-    steps = []
-    begun = fit(parts, buffer, config, seed=0, checkpoint=path, until=5)
-    assert [row["step"] for row in begun] == [3, 6]  # whole iterations
-    assert begun[-1]["loss_imitation"] == expected[1]["loss_imitation"]
-    fit(parts, buffer, config, seed=0, checkpoint=path, log=lambda _, step: steps.append(step))
-    assert steps == [9, 12]
-    assert same(weights(parts), weights(whole))
-
-
 def test_a_run_goes_on_within_a_round_of_all_samples(buffer, tmp_path):
     data = buffer.storage.get(slice(0, 256))
 
@@ -113,17 +100,6 @@ def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path):
         row.pop("samples_per_second")
     assert history == expected
     assert same(weights(whole), weights(resumed))
-
-
-def test_a_checkpoint_of_another_network_is_one_line(buffer, tmp_path):
-    config, options = FitConfig(steps=2, batch_size=8), {"seed": 0, "checkpoint": tmp_path / "a.pt"}
-    losses = [ImitationLoss(make_policy(SHAPES, seed=0, features=features)) for features in (8, 16)]
-    fit(losses[0], buffer, config, **options)
-    with pytest.raises(UserError, match="holds another loss than this run has") as error:
-        fit(losses[1], buffer, config, **options)
-    assert "\n" not in str(error.value)
-    with pytest.raises(UserError, match=r"made with seed=0, not 1"):
-        fit(losses[0], buffer, config, **{**options, "seed": 1})
 
 
 def test_the_schedule_warms_up_and_ends_near_zero():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, ParallelEnv, TransformedEnv, check_env_specs
@@ -68,18 +68,15 @@ def rewards():
     }
 
 
-def train(kind, algorithm, iterations):
+def train(kind, iterations):
     """Share of stops at the target, of all episodes, in the first and the last batch."""
     actor, critic = actor_and_critic()
-    if algorithm == "ppo":
-        loss = ClipPPOLoss(actor, critic, entropy_coeff=0.01)
-    else:
-        loss = ReinforceLoss(actor, critic)
+    loss = ClipPPOLoss(actor, critic, entropy_coeff=0.01)
     loss.set_keys(reward="learned_reward")
     # An action's reward is its own credit: summed, it would pay for going in circles.
     advantage = GAE(gamma=0.0 if kind == "action" else 0.95, lmbda=0.95, value_network=critic)
     advantage.set_keys(reward="learned_reward")
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2 if algorithm == "ppo" else 4e-2)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     frames = 32 * 24
     collector = Collector(
         make(rewards()[kind]),
@@ -93,7 +90,7 @@ def train(kind, algorithm, iterations):
         target = batch["instruction"][..., 0] - 1
         right = (shown(batch["pixels"]) == target) & (batch["action"] == STOP)
         success.append(float(right.sum() / batch["next", "done"].sum().clamp(min=1)))
-        for _ in range(8 if algorithm == "ppo" else 1):
+        for _ in range(8):
             with torch.no_grad():
                 advantage(batch)
             losses = loss(batch.reshape(-1))
@@ -106,7 +103,7 @@ def train(kind, algorithm, iterations):
 
 @pytest.mark.parametrize("kind", ["action", "goal"])
 def test_ppo_learns_from_the_learned_reward_alone(kind):
-    first, last = train(kind, "ppo", 12 if kind == "action" else 25)
+    first, last = train(kind, 12 if kind == "action" else 25)
     assert first < 0.3 and last > 0.8
 
 
@@ -193,15 +190,3 @@ def test_the_library_s_own_networks(world, networks, pool, kind):
     again = reward.clone()(rollout.exclude(("next", "learned_reward")))
     assert torch.allclose(again["next", "learned_reward"], paid, atol=1e-5)
     assert ((paid > 0) & (paid < 1)).any()
-
-
-def test_split_and_whole_networks_choose_alike(world, networks, pool):
-    suitability, _, _ = networks
-    sampler = InstructionSampler(suitability, pool)
-    assert sampler.scorer.network is suitability.module
-    whole = InstructionSampler(TensorDictSequential(suitability), pool)
-    assert whole.scorer.network is None
-    pixels = world.reset()["pixels"]
-    index = torch.arange(len(pool)).expand(6, -1)
-    logits = [one.scorer.score(one.scorer.encode(pixels), index) for one in (sampler, whole)]
-    assert torch.allclose(*logits, atol=1e-4)

@@ -149,7 +149,7 @@ def test_impossible_options(options, message):
 def test_what_does_not_fit_is_refused():
     with pytest.raises(UserError, match="stop_action=99 is no action"):
         make(goal(99)).rollout(1)
-    with pytest.raises(UserError, match=r"writes 'action_score'.* says 'goal_score'"):
+    with pytest.raises(UserError, match=r"writes 'action_score'.* writes 'goal_score'"):
         GoalReward(reward_model(), STOP)
     unnamed = TensorDictModule(lambda camera: camera, ["camera"], ["goal_score"])
     with pytest.raises(UserError, match="the image after the step; this one reads"):

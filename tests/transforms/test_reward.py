@@ -76,14 +76,6 @@ def test_mode_of_the_model_is_left_alone():
     assert not rollout["next", "learned_reward"].requires_grad
 
 
-def test_trained_weights_are_used_at_once():
-    model = reward_model()
-    env = make(LearnedReward(model))
-    with torch.no_grad():
-        model.module.right.zero_()
-    assert (env.rollout(5, expert)["next", "learned_reward"] == 0.5).all()
-
-
 def test_beside_a_reward_sum():
     env = make(LearnedReward(reward_model()))
     env.append_transform(RewardSum(in_keys=["learned_reward"], out_keys=["learned_return"]))

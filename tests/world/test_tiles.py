@@ -20,14 +20,14 @@ SIZES = (8, 16, 32)
 
 def every_cell() -> WorldState:
     """One world for each thing that a cell can be: box, object, arm, and what the arm holds."""
-    looks = [
+    appearances = [
         (box, under, arm, held)
         for box in range(8)
         for under in range(13)
         for arm, held in [(False, 0)] + [(True, held) for held in range(13)]
     ]
-    state = WorldState.empty(len(looks), size=3)
-    box, under, arm, held = (torch.tensor(column) for column in zip(*looks, strict=True))
+    state = WorldState.empty(len(appearances), size=3)
+    box, under, arm, held = (torch.tensor(column) for column in zip(*appearances, strict=True))
     state.arm = torch.where(arm, 4, 0)
     state.held = held.to(torch.uint8)
     state.objects[:, 4] = under.to(torch.uint8)

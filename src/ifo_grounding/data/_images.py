@@ -1,8 +1,7 @@
-"""Frames from images as Pillow opens them, and GIFs of which every frame comes back."""
+"""Frames from images and animations, as Pillow opens them."""
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Iterable, Iterator
 from io import BytesIO
@@ -31,10 +30,6 @@ BROKEN = (
     *(struct.error, Image.DecompressionBombError),
 )
 """What Pillow raises for files that are damaged, cut short, or no files."""
-COMMENT = b"ifo-grounding: a frame lasts %d ms"
-"""Written into a GIF, so that a frame that lasts longer is told from frames that are equal."""
-MOST_FRAMES = 100_000
-"""Frames that a GIF may show, repeated ones included."""
 
 
 def open_image(source: Path | bytes) -> Image.Image:
@@ -84,49 +79,15 @@ def stack_images(
 
 
 def animation_frames(path: Path) -> Iterator[tuple[int, Image.Image]]:
-    """Yield number and image of each frame of an animation.
-
-    Of a GIF that :func:`save_gif` wrote, equal frames in a row come as often as they were saved,
-    with the same number: Pillow writes them as one that lasts.
+    """Yield number and image of each frame of an animation, however long it is shown.
 
     Raises:
-        OSError: (or another of :data:`BROKEN`) where it is damaged or cut short, or shows more than
-            :data:`MOST_FRAMES`.
+        OSError: (or another of :data:`BROKEN`) where it is damaged or cut short.
     """
     content = regular_file(path).read_bytes()
     file = BytesIO(content + b"\0")
-    shown = 0
     with Image.open(file, formats=FORMATS) as opened:
-        said = re.fullmatch(COMMENT.replace(b"%d", b"([1-9]\\d*)"), opened.info.get("comment", b""))
-        for number, frame in enumerate(ImageSequence.Iterator(opened)):
-            times = round(frame.info.get("duration", 0) / int(said[1])) if said else 1
-            shown += max(1, times)
-            if shown > MOST_FRAMES:
-                raise OSError(f"it shows more than {MOST_FRAMES} frames")
-            for _ in range(max(1, times)):
-                yield number, frame
+        yield from enumerate(ImageSequence.Iterator(opened))
         # Pillow takes what there is of a GIF: without its last byte, it has read on to ours.
         if opened.format == "GIF" and file.tell() > len(content):
             raise OSError("it is cut short")
-
-
-def save_gif(path: Path, images: list[Image.Image], milliseconds: int) -> None:
-    """Write an animation whose frames last as long as each other.
-
-    Raises:
-        UserError: where it shows the same for longer than a GIF can say.
-    """
-    try:
-        images[0].save(
-            path,
-            save_all=True,
-            append_images=images[1:],
-            duration=milliseconds,
-            comment=COMMENT % milliseconds,
-            loop=0,
-        )
-    except OverflowError:
-        raise UserError(
-            f"episode {path.stem!r} stays the same for longer than a GIF can say: save it with "
-            "kind='png'"
-        ) from None

@@ -163,7 +163,7 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
 
     Returns:
         Demonstrations of ``n`` episodes, closed; with ``keep_truth`` also a
-        :class:`~ifo_grounding.data.truth.Truth` without goals.
+        :class:`~ifo_grounding.data.truth.Truth`.
 
     Raises:
         UserError: where minigrid is missing, there is no such level, or the bot fails too often.

@@ -12,14 +12,13 @@ from torch import Tensor
 from ifo_grounding import mosaic
 from ifo_grounding.data import _spool
 from ifo_grounding.data._spool import Spool, join
-from ifo_grounding.data._tile_index import TileIndex, cut
+from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
 
 TILE_SIZES = (8, 16, 32, 64)
 CODE_DTYPES = (torch.uint8, torch.int16, torch.int32)
 CHUNK_BYTES = 4 << 20
 SAMPLE_FRAMES = 256
-PATIENCE_FRAMES = 4096
 PATIENCE_BYTES = 64 << 20
 WORTH = 0.5
 """Share of the pixels that a dictionary and codes may take once patience is at its end."""
@@ -42,8 +41,7 @@ class FrameCodec:
         UserError: where tiles and image shape do not fit.
 
     >>> frames = torch.zeros(100, 3, 48, 48, dtype=torch.uint8)
-    >>> codec = FrameCodec.fit(frames)
-    >>> codes = codec.encode(frames)
+    >>> codec, codes = FrameCodec.compress(frames)
     >>> codes.dtype, codes.shape
     (torch.uint8, torch.Size([100, 3, 3]))
     >>> bool((codec.decode(codes) == frames).all())
@@ -54,9 +52,9 @@ class FrameCodec:
         channels, height, width = (int(side) for side in image_shape)
         self.image_shape = (channels, height, width)
         self.tile_size: int | None = None
-        self._index: TileIndex | None = None
+        self._index: _TileIndex | None = None
         if tiles is not None:
-            self._index = TileIndex(mosaic.words(tiles.cpu()).flatten(1))
+            self._index = _TileIndex(mosaic.words(tiles.cpu()).flatten(1))
             side = self.tile_size = int(tiles.shape[-1])
             if tiles.shape[1:] != (channels, side, side) or height % side or width % side:
                 raise UserError(
@@ -98,15 +96,10 @@ class FrameCodec:
         return f"FrameCodec({shape}, {len(self._index)} tiles of {self.tile_size})"
 
     @classmethod
-    def fit(cls, frames: Tensor | Iterable[Tensor], tile_size: int | None = None) -> FrameCodec:
-        """Return a codec that covers ``frames``; see :meth:`compress`."""
-        return cls.compress(frames, tile_size)[0]
-
-    @classmethod
     def compress(
         cls, frames: Tensor | Iterable[Tensor], tile_size: int | None = None
     ) -> tuple[FrameCodec, Tensor]:
-        """Fit a codec and encode in one pass.
+        """Return a codec of ``frames`` and their codes.
 
         Args:
             frames: images, uint8 [F, C, H, W], or an iterable of such pieces, which may come from
@@ -115,7 +108,8 @@ class FrameCodec:
             tile_size: 8, 16, 32 or 64; the cheapest one by default.
 
         Returns:
-            The codec, raw where a dictionary would not save memory, and codes [F, *code_shape].
+            The codec and codes [F, *code_shape]. It is raw where dictionary and codes take more
+            than the pixels, or more than half of them after the first 64 MiB of pixels.
 
         Raises:
             UserError: for images of another type or shape, or a tile size that does not fit them.
@@ -127,11 +121,11 @@ class FrameCodec:
             raise UserError("no frames: give at least one piece, uint8 [F, C, H, W]")
         image_shape = _checked(first).shape[1:]
         codec = cls._empty(image_shape, _tile_size(first, total or len(first), tile_size))
-        patience = min(PATIENCE_FRAMES, PATIENCE_BYTES // max(image_shape.numel(), 1))
+        patience = PATIENCE_BYTES // max(image_shape.numel(), 1)
         codes = Spool()
         seen = 0
         for piece in itertools.chain([first], pieces):
-            code = codec.update(piece)
+            code = codec._encode(piece)
             # Whoever gives pieces one by one may write to their memory again.
             codes.append(code.clone() if code is piece else code)
             seen += len(piece)
@@ -170,7 +164,7 @@ class FrameCodec:
         used = torch.zeros(len(tiles), dtype=torch.bool)
         for piece in given.split(PIECE_FRAMES):
             used[piece.flatten().long()] = True
-        distinct = TileIndex(torch.empty(0, tiles[0].numel() // mosaic.PIXELS_PER_WORD).long())
+        distinct = _TileIndex(torch.empty(0, tiles[0].numel() // mosaic.PIXELS_PER_WORD).long())
         numbers = torch.zeros(len(tiles), dtype=torch.int64)
         numbers[used] = distinct.add(mosaic.words(tiles[used]).flatten(1))
         order = torch.randperm(len(distinct), generator=generator)
@@ -180,21 +174,6 @@ class FrameCodec:
         numbers = order.argsort()[numbers].to(codec.code_dtype)
         codes = [numbers[piece.long()] for piece in given.split(PIECE_FRAMES)]
         return codec, join(codes, codec.code_dtype)
-
-    def encode(self, frames: Tensor) -> Tensor:
-        """Return the codes of ``frames``, uint8 [*B, C, H, W], as [*B, *code_shape].
-
-        Raises:
-            UserError: where a frame shows a tile that the dictionary lacks (see :meth:`update`).
-        """
-        return self._encode(frames, grow=False)
-
-    def update(self, frames: Tensor) -> Tensor:
-        """Add the tiles of ``frames`` to the dictionary and return their codes.
-
-        Earlier codes stay valid; their type may become too small for the later ones.
-        """
-        return self._encode(frames, grow=True)
 
     def decode(self, codes: Tensor) -> Tensor:
         """Return the pixels of ``codes`` [*B, *code_shape], uint8 [*B, C, H, W]."""
@@ -223,22 +202,23 @@ class FrameCodec:
                     f"{len(self._index)}"
                 )
 
-    def _encode(self, frames: Tensor, grow: bool) -> Tensor:
-        if _checked(frames, frames.ndim).shape[-3:] != self.image_shape:
+    def _encode(self, frames: Tensor) -> Tensor:
+        """Add the tiles of ``frames`` [F, C, H, W] to the dictionary and return their codes.
+
+        Earlier codes stay valid; their type may become too small for the later ones.
+        """
+        if _checked(frames).shape[1:] != self.image_shape:
             raise UserError(
-                f"frames are {list(frames.shape[-3:])}, this codec's are {list(self.image_shape)}"
+                f"frames are {list(frames.shape[1:])}, the first ones are {list(self.image_shape)}"
             )
         if self._index is None or self.tile_size is None:
             return frames.cpu()
-        batch = frames.shape[:-3]
-        frames = frames.cpu().reshape(-1, *self.image_shape)
-        chunk = max(1, CHUNK_BYTES // math.prod(self.image_shape))
         parts = []
-        for piece in frames.split(chunk):
-            tiles = cut(piece, self.tile_size)
-            numbers = self._index.add(tiles) if grow else self._index.find(tiles)
+        frames = frames.cpu().reshape(-1, *self.image_shape)  # strides as words need them
+        for piece in frames.split(max(1, CHUNK_BYTES // math.prod(self.image_shape))):
+            numbers = self._index.add(_cut(piece, self.tile_size))
             parts.append(numbers.to(self.code_dtype))
-        return join(parts, self.code_dtype).view(*batch, *self.code_shape)
+        return join(parts, self.code_dtype).view(-1, *self.code_shape)
 
     @classmethod
     def _empty(cls, image_shape: Sequence[int], tile_size: int | None) -> FrameCodec:
@@ -264,13 +244,57 @@ class FrameCodec:
         return FrameCodec(self.image_shape), codes.map(self.decode)
 
 
+def _cut(frames: Tensor, tile_size: int) -> Tensor:
+    """Cut frames, uint8 [F, C, H, W], into tiles as words, int64 [F * rows * columns, K]."""
+    count, channels, height, width = frames.shape
+    words = mosaic.as_words(frames)
+    across = tile_size // mosaic.PIXELS_PER_WORD
+    grid = (count, channels, height // tile_size, tile_size, width // tile_size, across)
+    return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)
+
+
+class _TileIndex:
+    """Distinct rows of words and their numbers, in the order in which they were added.
+
+    Args:
+        words: distinct rows, int64 [N, K].
+
+    Raises:
+        UserError: where a row comes twice.
+    """
+
+    def __init__(self, words: Tensor) -> None:
+        self.words = words
+        self._numbers = {row.tobytes(): number for number, row in enumerate(words.numpy())}
+        if len(self._numbers) != len(words):
+            raise UserError("tiles are not distinct: give each tile once")
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    def add(self, rows: Tensor) -> Tensor:
+        """Return the numbers of ``rows`` [M, K], int64 [M], adding those that are new."""
+        distinct, index = distinct_rows(rows)
+        known = len(self)
+        numbers = torch.tensor(
+            [
+                self._numbers.setdefault(row.tobytes(), len(self._numbers))
+                for row in distinct.numpy()
+            ],
+            dtype=torch.int64,
+        )
+        if len(self._numbers) > known:
+            self.words = torch.cat([self.words, distinct[numbers >= known]])
+        return numbers[index]
+
+
 def smallest_dtype(count: int) -> torch.dtype:
     """Return the smallest of uint8, int16 and int32 that holds ``0 .. count - 1``."""
     return next(dtype for dtype in CODE_DTYPES if count - 1 <= torch.iinfo(dtype).max)
 
 
-def _checked(frames: Tensor, ndim: int = 4) -> Tensor:
-    if not isinstance(frames, Tensor) or frames.dtype != torch.uint8 or frames.ndim != max(ndim, 3):
+def _checked(frames: Tensor) -> Tensor:
+    if not isinstance(frames, Tensor) or frames.dtype != torch.uint8 or frames.ndim != 4:
         kind = getattr(frames, "dtype", type(frames).__name__)
         shape = list(getattr(frames, "shape", []))
         raise UserError(f"frames must be a uint8 tensor [F, C, H, W], got {kind} {shape}")
@@ -294,6 +318,6 @@ def _tile_size(frames: Tensor, total: int, asked: int | None) -> int | None:
     costs = {}
     for size in fitting:
         codec = FrameCodec._empty(frames.shape[1:], size)
-        code = codec.update(sample)[0]
+        code = codec._encode(sample)[0]
         costs[size] = (0 if codec.words is None else codec.words.nbytes) + total * code.nbytes
     return min(costs, key=costs.__getitem__)

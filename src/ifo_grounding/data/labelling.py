@@ -65,14 +65,6 @@ class LabelReport:
             rows.append(row)
         return rows
 
-    def __str__(self) -> str:
-        names = ("count", "mean", *QUANTILES)
-        lines = ["action " + "".join(f"{name:>9}" for name in names)]
-        for row in self.summary():
-            cells = [f"{row[name]:9.4f}" if name in row else " " * 9 for name in names[1:]]
-            lines.append(f"{row['action']:<7}{row['count']:>9}" + "".join(cells))
-        return "\n".join(lines)
-
     def save(self, folder: str | Path) -> None:
         """Write a folder; :func:`labelled_buffer` makes the buffer again from it."""
         arrays = {"actions": self.actions, "confidence": self.confidence}
@@ -83,14 +75,7 @@ class LabelReport:
         """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`."""
         arrays, facts = load_folder(folder, KIND, ("actions", "confidence"))
         with damaged(folder):
-            report = cls(arrays["actions"], arrays["confidence"], facts["n_actions"])
-            if report.actions.is_floating_point() or not report.confidence.is_floating_point():
-                raise UserError("actions are whole numbers, confidences are not")
-            if report.actions.shape != report.confidence.shape:
-                raise UserError("actions and confidence are not of one length")
-            if len(report.counts) != report.n_actions:
-                raise UserError(f"it holds an action outside 0..{report.n_actions - 1}")
-            return report
+            return cls(arrays["actions"], arrays["confidence"], facts["n_actions"])
 
 
 class Labelled(NamedTuple):

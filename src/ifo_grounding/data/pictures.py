@@ -21,7 +21,6 @@ from ifo_grounding.data._images import (
     SUFFIXES,
     animation_frames,
     open_image,
-    save_gif,
     stack_images,
 )
 from ifo_grounding.data._video import read_video, write_video
@@ -31,9 +30,9 @@ from ifo_grounding.data.listing import LIST, VIDEOS, Listed, read_list
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.files import atomic_write
 
-KINDS = ("png", "gif", "mp4")
+KINDS = ("png", "mp4")
 COLOURS = (1, 3)
-MILLISECONDS = 250
+FRAMES_PER_SECOND = 4
 
 
 def load_pictures(
@@ -48,9 +47,8 @@ def load_pictures(
     ``video``). A line may name another path as ``"frames"``, and say ``"truncated": true`` of a
     recording that was cut, whose last frame is no stop.
 
-    Frames that are numbered have to be numbered evenly: a missing one is an error. A GIF of
-    :func:`save_pictures` comes back with every frame. Of other GIFs, each picture is one frame
-    however long it lasts.
+    Frames that are numbered have to be numbered evenly: a missing one is an error. Each picture of
+    a GIF is one frame, however long it lasts.
 
     Frames are read one episode after the other: the pixels of all episodes are never in memory
     together. A video is lossy: its frames are those that a player shows, not those that were
@@ -163,9 +161,8 @@ def save_pictures(
         demos: with a vocabulary.
         folder: where to, a new or an empty one; it appears when everything is written, and
             :func:`load_pictures` reads it.
-        kind: ``png``, a folder of frames per episode; ``gif``, an animation of each; or ``mp4``, a
-            video of each, with the extra ``video``. A GIF holds 256 colours a frame, and a video is
-            lossy: to keep frames as they are, take ``png``.
+        kind: ``png``, a folder of frames per episode, without loss; or ``mp4``, a video of each,
+            with loss, with the extra ``video``.
         scale: by which every pixel is enlarged.
 
     Raises:
@@ -194,15 +191,11 @@ def save_pictures(
 
 def _save_episode(path: Path, frames: np.ndarray, kind: str) -> None:
     if kind == "mp4":
-        write_video(path.with_suffix(".mp4"), frames, fps=1000 / MILLISECONDS)
-        return
-    images = [Image.fromarray(frame) for frame in frames]
-    if kind == "gif":
-        save_gif(path.with_suffix(".gif"), images, MILLISECONDS)
+        write_video(path.with_suffix(".mp4"), frames, fps=FRAMES_PER_SECOND)
         return
     path.mkdir()
-    for step, image in enumerate(images):
-        image.save(path / f"{step:04d}.png")
+    for step, frame in enumerate(frames):
+        Image.fromarray(frame).save(path / f"{step:04d}.png")
 
 
 def written_sentences(demos: Demonstrations, colours: tuple[int, ...] = COLOURS) -> list[str]:

@@ -16,7 +16,6 @@ from ifo_grounding.data.truth import Truth
 from ifo_grounding.errors import at_least_one, check_choice
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
-from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import Scene, SceneOptions
 from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY
@@ -51,7 +50,7 @@ def record_demonstrations(
     Args:
         task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
         n: number of demonstrations.
-        keep_truth: whether to return actions and goals too, for evaluation only.
+        keep_truth: whether to return the actions too, for evaluation only.
         seed: same seed, same demonstrations.
         tile_size: pixels along one side of a cell: 8, 16 or 32.
         progress: whether to show a bar.
@@ -89,9 +88,7 @@ def record_demonstrations(
     codec, codes = FrameCodec.from_tiles(tile_table(tile_size), parts, numbering)
     tokens = torch.cat(instructions)
     demos = Demonstrations(codec, codes, torch.cat(lengths), tokens, vocabulary=VOCABULARY)
-    if not keep_truth:
-        return demos
-    return demos, Truth(torch.cat(actions), grammar(task).parse_tokens(tokens.long()))
+    return (demos, Truth(torch.cat(actions))) if keep_truth else demos
 
 
 @contextlib.contextmanager

@@ -96,11 +96,6 @@ class TransitionReport:
     kept: Tensor
     """Of these, steps in the buffer, int64 [A]."""
 
-    def __str__(self) -> str:
-        rows = zip(self.taken.tolist(), self.kept.tolist(), strict=True)
-        lines = [f"{action:<7}{taken:>9}{kept:>9}" for action, (taken, kept) in enumerate(rows)]
-        return "\n".join(["action     taken     kept", *lines])
-
 
 class Collected(NamedTuple):
     """Random transitions in a replay buffer, and their counts."""
@@ -139,12 +134,7 @@ class Collected(NamedTuple):
         codes, after, action, taken, kept = (arrays[name] for name in names)
         with damaged(folder):
             codec = FrameCodec(facts["image_shape"], arrays.get("tiles"))
-            codec.check(codes)
-            codec.check(after)
-            if not len(action) or len(action.bincount(minlength=len(taken))) > len(taken):
-                raise UserError("it holds no actions, or unknown ones")
-            report = TransitionReport(taken, kept)
-            return cls(_buffer(codec, codes, action, after, options), report)
+            return cls(_buffer(codec, codes, action, after, options), TransitionReport(taken, kept))
 
 
 def _buffer(

@@ -18,14 +18,12 @@ from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.evaluation.scenes import Player, play_scenes
 from ifo_grounding.tasks.goals import SIDES, Goal, Plan
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.world import SHAPES, WorldState, kind_name, neighbour
+from ifo_grounding.world import WorldState, neighbour
 
 ENDINGS = ("success", "stuck", "wrong object", "wrong place", "nothing done")
 """How an episode can end. `stuck`: it never stopped. `nothing done`: it stopped without having
 moved the object that it was to carry."""
 SUCCESS, STUCK, WRONG_OBJECT, WRONG_PLACE, NOTHING_DONE = range(5)
-SHARED = ("both", "colour", "shape", "neither")
-"""What a wrong object has in common with the right one: both if it lies in another box."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +32,6 @@ class Endings:
 
     kind: Tensor
     """Index into :data:`ENDINGS`, int64 [N]."""
-    wanted: Tensor
-    """Kind of the object that the instruction is about, 1..12, int64 [N]."""
-    mistaken: Tensor
-    """Kind of the object that was gone to or carried in its place, else 0, int64 [N]."""
     actions: Tensor
     """What was done, int8 [N, max_steps]; -1 after the end."""
     scenes: str
@@ -48,27 +42,9 @@ class Endings:
         """Episodes by how they ended."""
         return _counts(self.kind)
 
-    @property
-    def shared(self) -> dict[str, int]:
-        """Wrong objects by what they have in common with the right one."""
-        wrong, n = self.kind == WRONG_OBJECT, len(SHAPES)  # kind - 1 is colour * n + shape
-        mistaken, wanted = self.mistaken[wrong] - 1, self.wanted[wrong] - 1
-        colour, shape = mistaken // n == wanted // n, mistaken % n == wanted % n
-        found = (3 - 2 * colour.long() - shape.long()).bincount(minlength=len(SHARED))
-        return dict(zip(SHARED, found.tolist(), strict=True))
-
-    @property
-    def by_object(self) -> dict[str, list[int]]:
-        """Successes and episodes by the object that the instruction is about."""
-        rows = ((kind_name(int(number)), self.wanted == number) for number in self.wanted.unique())
-        return {
-            name: [int((self.kind[asked] == SUCCESS).sum()), int(asked.sum())]
-            for name, asked in rows
-        }
-
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON: the counts."""
-        return {"counts": self.counts, "shared": self.shared, "by_object": self.by_object}
+        return {"counts": self.counts}
 
 
 def episode_endings(
@@ -91,8 +67,8 @@ def episode_endings(
     50
     """
     numbers = range(at_least_one("episodes", episodes))
-    (kind, wanted, mistaken, actions), scenes = play_scenes(policy, task, numbers, _play, **options)
-    return Endings(kind, wanted, mistaken, actions, scenes)
+    (kind, actions), scenes = play_scenes(policy, task, numbers, _play, **options)
+    return Endings(kind, actions, scenes)
 
 
 def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
@@ -122,7 +98,7 @@ def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
 
 
 def _play(player: Player, env: EnvBase, start: TensorDictBase) -> tuple[Tensor, ...]:
-    """Return how episodes ended, what was wanted and mistaken, and what was done."""
+    """Return how episodes ended, and what was done."""
     assert isinstance(env, PickAndPlaceEnv)
     first, wanted = env.truth.state.clone(), env.truth.wanted.clone()
     goal = grammar(env.task).parse_tokens(start[keys.INSTRUCTION])
@@ -137,14 +113,13 @@ def _play(player: Player, env: EnvBase, start: TensorDictBase) -> tuple[Tensor, 
         taken[rows] += 1
 
     outcomes = player(env, start, on_step=keep)
-    kind, mistaken = _ending(first, last, wanted, goal, outcomes)
-    return kind, goal.object, mistaken, actions
+    return _ending(first, last, wanted, goal, outcomes), actions
 
 
 def _ending(
     first: WorldState, last: WorldState, wanted: Plan, goal: Goal, outcomes: Outcomes
-) -> tuple[Tensor, Tensor]:
-    """Return how episodes ended, index into ENDINGS [B], and wrong objects [B]."""
+) -> Tensor:
+    """Return how episodes ended, index into ENDINGS [B]."""
     gone_to = _gone_to(last, goal)
     carried = _carried(first, last, wanted, goal)
     mistaken = torch.where(goal.carries, carried, gone_to)
@@ -152,8 +127,7 @@ def _ending(
     kind = torch.where(mistaken > 0, WRONG_OBJECT, WRONG_PLACE)
     kind = torch.where(untouched, NOTHING_DONE, kind)
     kind = torch.where(outcomes.stopped, kind, STUCK)
-    kind = torch.where(outcomes.success, SUCCESS, kind)
-    return kind, torch.where(kind == WRONG_OBJECT, mistaken, 0)
+    return torch.where(outcomes.success, SUCCESS, kind)
 
 
 def _gone_to(last: WorldState, goal: Goal) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,12 +24,6 @@ class LabelAccuracy(Described):
     """Share of right labels among the transitions of each action."""
     worst: str
     """The action that is labelled worst, of those that occur."""
-    confusion: Tensor
-    """Counts by truth (rows) and label (columns), int64 [A, A]."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {**super().as_dict(), "confusion": self.confusion.tolist()}
 
     def __str__(self) -> str:
         """Return the accuracy, and the worst action's."""
@@ -73,13 +66,12 @@ def label_accuracy(
     n = len(names)
     if int(torch.stack([given, right]).min()) < 0 or int(torch.stack([given, right]).max()) >= n:
         raise UserError(f"actions must be 0..{n - 1}, as there are {n} names")
-    confusion = torch.bincount(right * n + given, minlength=n * n).reshape(n, n)
-    hits, counts = confusion.diagonal().tolist(), confusion.sum(1).tolist()
+    hits = right[given == right].bincount(minlength=n).tolist()
+    counts = right.bincount(minlength=n).tolist()
     per_action = {name: wilson(*pair) for name, *pair in zip(names, hits, counts, strict=True)}
     seen = {name: rate for name, rate in per_action.items() if rate.count}
     return LabelAccuracy(
         rate=wilson(sum(hits), sum(counts)),
         per_action=per_action,
         worst=min(seen, key=lambda name: seen[name].rate),
-        confusion=confusion,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,7 +46,6 @@ def reward_audit(
     *,
     transitions: int = 5000,
     seed: int = 0,
-    names: Sequence[str] | None = None,
 ) -> RewardAudit:
     """Score every action in transitions of held-out demonstrations, and compare with the expert's.
 
@@ -61,15 +60,14 @@ def reward_audit(
             :class:`~ifo_grounding.data.Truth`.
         transitions: how many to draw, without repetition.
         seed: of the draw.
-        names: of the actions; by default the grid's, or numbers where the model knows more or
-            fewer.
 
     Raises:
-        UserError: where truth does not have one action per transition, or there is not one name for
-            each action that the model knows, or nothing to draw.
+        UserError: where truth does not have one action per transition, or one that the model does
+            not know, or nothing to draw.
     """
     transitions = at_least_one("transitions", transitions)
-    names = _names_for(reward_model, names)
+    shapes = getattr(reward_model, "shapes", None)
+    names = keys.action_names(getattr(shapes, "n_actions", keys.N_ACTIONS))
     actions = actions_of(truth)
     if len(actions) != demos.transitions or not len(actions):
         raise UserError(
@@ -78,8 +76,8 @@ def reward_audit(
         )
     if int(actions.max()) >= len(names):
         raise UserError(
-            f"truth has the action {int(actions.max())}, of {len(names)} with a name: give names= "
-            "of all actions"
+            f"truth has the action {int(actions.max())}, the model knows {len(names)}: give the "
+            "reward model of this world"
         )
     order = torch.randperm(len(actions), generator=generator(seed, "reward-audit"))
     drawn = order[:transitions].sort().values
@@ -97,16 +95,6 @@ def reward_audit(
         },
         first=wilson(int((scores[taken] > others).sum()), len(drawn)),
     )
-
-
-def _names_for(model: TensorDictModuleBase, names: Sequence[str] | None) -> Sequence[str]:
-    """Return a name for each action that a model knows, as far as it says how many that are."""
-    known = getattr(getattr(model, "shapes", None), "n_actions", len(names or keys.ACTIONS))
-    if names is None:
-        return keys.action_names(known)
-    if len(names) != known:
-        raise UserError(f"the model knows {known} actions, not {len(names)}: name each of them")
-    return names
 
 
 def _score_actions(

@@ -15,6 +15,7 @@ from torch import nn
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import atomic_write
+from ifo_grounding.machine import check_device
 from ifo_grounding.networks.building import Blueprint
 from ifo_grounding.networks.goal import make_goal_classifier
 from ifo_grounding.networks.instruction import make_instruction_classifier
@@ -74,7 +75,7 @@ def load(
         UserError: where the file is missing, damaged, of another origin, or of another kind, or
             where there is no such device.
     """
-    _check_device(device)
+    check_device(device or "cpu")
     content, weights = _read(Path(path))
     found = str(content.get("kind"))
     if kind is not None and kind != found:
@@ -95,16 +96,6 @@ def load(
             " train the network again"
         ) from None
     return module
-
-
-def _check_device(device: torch.device | str | None) -> None:
-    try:
-        torch.empty(0, device=device or "cpu")
-    except (RuntimeError, AssertionError) as error:  # the latter where PyTorch is built without it
-        raise UserError(
-            f"no network can be built on device {str(device)!r} here "
-            f"({str(error).splitlines()[0]}): name another, such as 'cpu'"
-        ) from None
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

@@ -1,13 +1,13 @@
 """Showing what was learned: tables, plots, animations, case studies, and one page with all."""
 
 from ifo_grounding.report.animation import animation
-from ifo_grounding.report.audit import audit_figure
-from ifo_grounding.report.casestudy import Case, gallery, instruction_cases
+from ifo_grounding.report.casestudy import instruction_cases
+from ifo_grounding.report.drawing import Captioned, gallery
 from ifo_grounding.report.page import write_report
 from ifo_grounding.report.plots import (
+    audit_figure,
     rates_by_number,
     reliability_diagram,
-    success_over_iterations,
     training_curves,
 )
 from ifo_grounding.report.provenance import provenance
@@ -17,7 +17,7 @@ from ifo_grounding.report.theme import figure_png
 from ifo_grounding.report.tracing import trace_animation
 
 __all__ = [
-    "Case",
+    "Captioned",
     "animation",
     "audit_figure",
     "figure_png",
@@ -30,7 +30,6 @@ __all__ = [
     "reliability_diagram",
     "results_rows",
     "results_table",
-    "success_over_iterations",
     "text_table",
     "trace_animation",
     "training_curves",

@@ -10,7 +10,7 @@ from PIL import Image
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.recording import Episode
-from ifo_grounding.report.drawing import Cell, draw_sheet
+from ifo_grounding.report.drawing import Captioned, draw_sheet
 from ifo_grounding.report.theme import BAD, GOOD, RUNNING
 
 COLOURS = 128
@@ -71,15 +71,15 @@ def animation(
     return gif(pictures, fps, hold)
 
 
-def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Cell:
+def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Captioned:
     last = len(episode.frames) - 1
     frame, ended = episode.frames[min(step, last)], step >= last
     if not ended:
         note = f"step {step}" if step == 0 else f"step {step}: {actions[episode.actions[step - 1]]}"
-        return Cell(frame, episode.sentence, title, note, RUNNING)
+        return Captioned(frame, episode.sentence, title, note, RUNNING)
     ending = "success" if episode.success else "failure"
     note = f"{ending} after {last}" if episode.stopped else f"{ending}, never stopped"
-    return Cell(frame, episode.sentence, title, note, GOOD if episode.success else BAD)
+    return Captioned(frame, episode.sentence, title, note, GOOD if episode.success else BAD)
 
 
 def gif(pictures: Sequence[Image.Image], fps: float, hold: float) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,8 +18,8 @@ from ifo_grounding.report.theme import FAINT, INK, PAPER, RUNNING
 BORDER, PADDING, TEXT_SIZE, LINE = 4, 8, 14, 19
 
 
-class Cell(NamedTuple):
-    """One captioned picture."""
+class Captioned(NamedTuple):
+    """A picture with its caption, such as a state with the instruction that was chosen for it."""
 
     frame: np.ndarray
     """Pixels, uint8 [3, H, W]."""
@@ -67,7 +68,7 @@ def wrapped(text: str, width: int) -> list[str]:
     return lines
 
 
-def draw_sheet(cells: Sequence[Cell], *, columns: int, width: int) -> Image.Image:
+def draw_sheet(cells: Sequence[Captioned], *, columns: int, width: int) -> Image.Image:
     """Draw captioned pictures of one size in a grid.
 
     Args:
@@ -90,7 +91,20 @@ def draw_sheet(cells: Sequence[Cell], *, columns: int, width: int) -> Image.Imag
     return sheet
 
 
-def _draw_cell(cell: Cell, width: int, above: int, below: int) -> Image.Image:
+def gallery(cells: Sequence[Captioned], *, columns: int = 4, width: int = 200) -> bytes:
+    """Return captioned pictures side by side as a PNG; arguments as :func:`draw_sheet`.
+
+    >>> gallery([Captioned(np.zeros((3, 48, 48), dtype=np.uint8), "move to the red circle")])[1:4]
+    b'PNG'
+    """
+    if not cells:
+        raise UserError("a gallery needs at least one picture")
+    buffer = io.BytesIO()
+    draw_sheet(cells, columns=columns, width=width).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _draw_cell(cell: Captioned, width: int, above: int, below: int) -> Image.Image:
     """Draw one picture with pixels above it for the title, and below it for caption and note."""
     picture = upscaled(cell.frame, width)
     framed = (picture.width + 2 * BORDER, picture.height + 2 * BORDER)

@@ -16,15 +16,14 @@ from matplotlib.figure import Figure
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import atomic_write, write_json
-from ifo_grounding.report.casestudy import Case, gallery
-from ifo_grounding.report.drawing import upscaled
+from ifo_grounding.report.drawing import Captioned, gallery, upscaled
 from ifo_grounding.report.tables import columns_of, format_cell, is_number
 from ifo_grounding.report.theme import figure_png
 
 PIXELS_PER_INCH = 84
 SUFFIXES = {b"\x89PNG": "png", b"GIF8": "gif", b"\xff\xd8\xff": "jpeg"}
-Picture = Figure | bytes | str | Path | np.ndarray | Sequence[Case]
-"""A matplotlib figure, an image file or its bytes, pixels uint8 [3, H, W], or cases."""
+Picture = Figure | bytes | str | Path | np.ndarray | Sequence[Captioned]
+"""A matplotlib figure, an image file or its bytes, pixels uint8 [3, H, W], or captioned ones."""
 
 
 def write_report(
@@ -34,7 +33,6 @@ def write_report(
     *,
     title: str = "Report",
     summary: str = "",
-    notes: Mapping[str, str] | None = None,
 ) -> Path:
     """Write a folder with ``index.html``, ``results.json`` and ``pictures/``.
 
@@ -48,10 +46,9 @@ def write_report(
             a table of two columns, a list of mappings a table with a column per key, a text a
             paragraph.
         pictures: by heading: matplotlib figures, image files or bytes, pixels uint8 [3, H, W], or
-            lists of :class:`~ifo_grounding.report.Case`.
+            lists of :class:`~ifo_grounding.report.Captioned`.
         title: of the page.
         summary: a sentence below the title.
-        notes: sentences below headings of results or pictures, by heading.
 
     Returns:
         Path of the page.
@@ -62,9 +59,7 @@ def write_report(
     >>> page.name, sorted(path.name for path in page.parent.iterdir())
     ('index.html', ['index.html', 'results.json'])
     """
-    folder, pictures, notes = Path(folder), pictures or {}, notes or {}
-    if unknown := set(notes) - set(results) - set(pictures):
-        raise UserError(f"notes about {sorted(unknown)}, which are no headings of the report")
+    folder, pictures = Path(folder), pictures or {}
     cards, sections = [], []
     for name, value in results.items():
         if is_number(value) and value is not None and not isinstance(value, bool):
@@ -74,7 +69,6 @@ def write_report(
     files = _file_names(pictures)
     for name, picture in pictures.items():
         sections.append({"name": name, **_picture(picture, folder / "pictures" / files[name])})
-    sections = [{**section, "note": notes.get(section["name"])} for section in sections]
     # Every text is escaped by the template: instructions and names come from users.
     pages = Environment(
         loader=PackageLoader("ifo_grounding.report", ""),
@@ -157,7 +151,7 @@ def _picture(picture: Picture, path: Path) -> dict[str, Any]:
         if not picture:
             return {"text": "None."}
         _keep(path, gallery(picture))
-        return {"cases": [(case, _data(_png(case.picture))) for case in picture]}
+        return {"cases": [(case, _data(_png(case.frame))) for case in picture]}
     content = _image_bytes(picture)  # type: ignore[arg-type]
     _keep(path, content)
     return {"image": _data(content)}

@@ -26,6 +26,23 @@ from ifo_grounding.stats import Rate
 
 SHARES = ("accuracy", "probability", "removed", "share", "stopped", "success", "sampled")
 """Last words of the names of metrics that are shares, and drawn in percent."""
+PANELS: dict[str, dict[str, str]] = {
+    "Learned return and true success": {
+        "audit_return": "learned return",
+        "audit_success": "true success",
+    },
+    "True success": {"success": "greedy", "success_sampled": "sampled"},
+    "Chosen instructions": {"suitable": "suitable", "served_share": "states served"},
+    "Learned rewards against the truth (AUC)": {
+        "return_auc": "return: success above failure",
+        "action_auc": "reward: expert's action above another",
+    },
+    "Episode length": {"episode_length": "steps"},
+    "Entropy of the policy": {"entropy": "nats"},
+}
+"""Panels of the picture: the logged metrics of each, with what they are called there."""
+IN_PERCENT = tuple(PANELS)[:4]
+"""Panels in percent."""
 LABELS_APART = 0.1
 """Share of an axis that two of its labels keep between them."""
 
@@ -43,20 +60,15 @@ def known(history: Sequence[Mapping[str, float | None]], name: str) -> list[tupl
 def training_curves(
     history: Sequence[Mapping[str, float | None]],
     names: Sequence[str] | None = None,
-    *,
-    smooth: int | None = None,
-    columns: int = 2,
-    x: str = "step",
 ) -> Figure:
     """Draw one small plot per metric: every value faintly, their running mean on top.
+
+    The mean is over a fiftieth of the values.
 
     Args:
         history: what was logged, as :func:`~ifo_grounding.training.fit` returns it: a row per
             step with ``step`` and metrics. Values that are None or not finite are left out.
         names: which metrics, in which order; all where None.
-        smooth: how many values a running mean covers; a fiftieth of them where None.
-        columns: plots side by side.
-        x: what the steps count.
 
     Raises:
         UserError: where a name was not logged.
@@ -71,16 +83,17 @@ def training_curves(
     missing = [name for name in chosen if name not in logged]
     if missing or not chosen:
         raise UserError(f"no metric {missing or ''}: logged were {', '.join(logged) or 'none'}")
-    figure, panels = new_panels(len(chosen), 4.2, 2.5, columns)
+    figure, panels = new_panels(len(chosen), 4.2, 2.5)
     for axes, (name, points) in zip(panels, series.items(), strict=True):
-        _curve(axes, name, points, smooth or max(1, len(points) // 50), x)
+        _curve(axes, name, points)
     return figure
 
 
-def _curve(axes: Axes, name: str, points: Sequence[tuple[float, float]], span: int, x: str) -> None:
-    dress(axes, name, x)
+def _curve(axes: Axes, name: str, points: Sequence[tuple[float, float]]) -> None:
+    dress(axes, name, "step")
     if not points:
         return
+    span = max(1, len(points) // 50)
     steps, values = zip(*points, strict=True)
     if span > 1:
         axes.plot(steps, values, color=PALETTE[4], alpha=0.45, linewidth=0.8)
@@ -92,60 +105,66 @@ def _curve(axes: Axes, name: str, points: Sequence[tuple[float, float]], span: i
         in_percent(axes)
 
 
-def success_over_iterations(
-    iterations: Sequence[float],
-    rates: Sequence[Rate],
-    *,
-    before: Rate | None = None,
-    title: str = "Success during self-examination",
-    x: str = "iteration",
-) -> Figure:
-    """Draw success with its interval over the iterations of phase 2.
+def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
+    """Draw the audit of a self-examination.
+
+    Reward hacking shows in the first panel: the learned return rises, and true success does not.
+    Both are measured on the same rollouts of scenes with true instructions.
 
     Args:
-        iterations: when success was measured.
-        rates: what it was.
-        before: success before the first iteration, drawn as a dashed line.
-        title: above the plot.
-        x: what the iterations count.
+        history: what ``self_examine`` returned, with the metrics of the recipes' audit; metrics
+            that an iteration lacks are left out, as are those that are not defined there (an AUC
+            where every episode succeeds).
 
-    >>> from ifo_grounding.stats import wilson
-    >>> figure = success_over_iterations([0, 10], [wilson(50, 100), wilson(80, 100)])
-    >>> figure.axes[0].get_xlabel()
-    'iteration'
+    Raises:
+        UserError: where the history holds none of the metrics of the picture.
+
+    >>> rows = [{"step": 1.0, "entropy": 0.5}, {"step": 2.0, "entropy": 0.4, "success": 0.9}]
+    >>> [axes.get_title(loc="left") for axes in audit_figure(rows).axes if axes.get_visible()]
+    ['True success', 'Entropy of the policy']
     """
-    if len(rates) != len(iterations):
-        raise UserError(f"rates must be one per iteration, {len(iterations)} of them")
-    figure, grid = new_figure(7.0, 3.6)
-    axes = grid[0, 0]
-    dress(axes, title, x)
-    low, high = [rate.low for rate in rates], [rate.high for rate in rates]
-    axes.fill_between(iterations, low, high, color=PALETTE[0], alpha=0.18, linewidth=0)
-    centre = [rate.rate for rate in rates]
-    axes.plot(iterations, centre, color=PALETTE[0], linewidth=2, marker="o", ms=4)
-    if before is not None:
-        label = f"phase 1: {100 * before.rate:.1f}%"
-        axes.axhline(before.rate, color=FAINT, linestyle="--", linewidth=1.4, label=label)
-        add_legend(axes, loc="best")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    in_percent(axes)
+    points = {name: known(history, name) for lines in PANELS.values() for name in lines}
+    panels = [
+        (title, {label: points[name] for name, label in lines.items() if points[name]})
+        for title, lines in PANELS.items()
+    ]
+    panels = [(title, lines) for title, lines in panels if lines]
+    if not panels:
+        raise UserError("the history holds nothing to audit: was it a self-examination?")
+    figure, grid = new_panels(len(panels), 4.4, 2.6)
+    for axes, (title, lines) in zip(grid, panels, strict=True):
+        _panel(axes, title, lines)
+        axes.set_xlim(history[0]["step"] - 0.5, history[-1]["step"] + 0.5)
     return figure
+
+
+def _panel(axes: Axes, title: str, lines: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    """Draw one panel: the points of each line, by label."""
+    dress(axes, title, "iteration")
+    for (label, points), colour in zip(lines.items(), PALETTE, strict=False):
+        marker = "o" if len(points) <= 30 else ""
+        style: dict[str, Any] = {"linewidth": 1.8, "marker": marker, "ms": 3.5}
+        axes.plot(*zip(*points, strict=True), color=colour, label=label, **style)
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
+    if title in IN_PERCENT:
+        low = min(axes.get_ylim()[0], 0.9)
+        top = max(1.0, *(value for points in lines.values() for _, value in points))
+        in_percent(axes, low)
+        axes.set_ylim(top=top + 0.05 * (top - low))  # a return can exceed 1
+    if len(lines) > 1:
+        add_legend(axes, loc="best")
 
 
 def rates_by_number(
     panels: Mapping[str, Mapping[str, Mapping[int, Rate]]],
     *,
-    x: str = "demonstrations",
     references: Mapping[str, Mapping[str, float]] | None = None,
-    columns: int = 3,
 ) -> Figure:
-    """Draw rates against a number that grows by factors, with intervals, one panel per group.
+    """Draw rates against the number of demonstrations, with intervals, one panel per group.
 
     Args:
         panels: title of the panel -> {name of the curve: {number: rate}}.
-        x: what the number counts.
         references: title of the panel -> {name: rate}, each drawn as a dashed line across.
-        columns: panels side by side.
 
     >>> from ifo_grounding.stats import wilson
     >>> curves = {"phase 1": {500: wilson(60, 100), 2000: wilson(80, 100)}}
@@ -160,9 +179,9 @@ def rates_by_number(
     numbers = sorted({number for curve in every for number in curve})
     lines = [rate for panel in (references or {}).values() for rate in panel.values()]
     low = min([*lines, *(rate.low for curve in every for rate in curve.values())])
-    figure, grid = new_panels(len(panels), 3.2, 3.0, columns)
+    figure, grid = new_panels(len(panels), 3.2, 3.0, columns=3)
     for axes, (title, curves) in zip(grid, panels.items(), strict=True):
-        dress(axes, title, x)
+        dress(axes, title, "demonstrations")
         axes.set_xscale("log")
         for name, curve in curves.items():
             place = names.index(name)

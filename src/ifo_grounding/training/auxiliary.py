@@ -57,8 +57,6 @@ class AdversarialUpdates:
         steps: gradient steps after each iteration of self-examination.
         lr: learning rate.
         batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
-        smoothing: how far the targets are from 1 and 0, for the policy is often right.
-        grad_clip: largest norm of the gradient.
     """
 
     def __init__(
@@ -68,11 +66,9 @@ class AdversarialUpdates:
         steps: int,
         lr: float,
         batch_size: int = 256,
-        smoothing: float = 0.1,
-        grad_clip: float = 1.0,
     ) -> None:
-        self.loss, self.demonstrations, self.steps = loss, demonstrations, steps
-        self.batch_size, self.smoothing, self.grad_clip = batch_size, smoothing, grad_clip
+        self.loss, self.demonstrations = loss, demonstrations
+        self.steps, self.batch_size = steps, batch_size
         self.optimizer = make_optimizer(loss.parameters(), lr)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
@@ -82,7 +78,7 @@ class AdversarialUpdates:
         for _ in range(self.steps):
             rows = torch.randint(len(policy_steps), (self.batch_size,))
             shown = beside(self.demonstrations.sample(self.batch_size), self.loss)
-            losses = self.loss.adversarial(shown, policy_steps[rows], self.smoothing)
-            for key, value in update(losses, self.optimizer, self.grad_clip).items():
+            losses = self.loss.adversarial(shown, policy_steps[rows])
+            for key, value in update(losses, self.optimizer, grad_clip=1.0).items():
                 totals[key] = totals.get(key, 0.0) + float(value) / self.steps
         return {f"reward/{key}": value for key, value in totals.items()}

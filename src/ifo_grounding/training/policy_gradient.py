@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -40,7 +39,6 @@ class Learner:
         imitation: AuxiliaryImitation | None = None,
     ) -> None:
         self.config, self.policy, self.value, self.imitation = config, policy, value, imitation
-        self.reference = copy.deepcopy(policy).requires_grad_(False) if config.kl_penalty else None
         self.collector = _make_collector(env, policy, config.steps)
         self.batches: Iterator[TensorDictBase] | None = None
         self.advantage = GAE(
@@ -66,20 +64,6 @@ class Learner:
         if self.batches is None:
             self.batches = iter(self.collector)
         return next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
-
-    @torch.no_grad()
-    def penalise_divergence(self, batch: TensorDictBase) -> Metrics:
-        """Take ``kl_penalty`` times log(policy / phase-1 policy) of each action off its reward."""
-        if self.reference is None:
-            return {}
-        steps = batch.reshape(-1)
-        parts = steps.select(*self.policy.in_keys, keys.ACTION).split(4096)
-        reference = torch.cat([_log_prob(self.reference, part) for part in parts])
-        current = torch.cat([_log_prob(self.policy, part) for part in parts])
-        away = (current - reference).reshape(*batch.shape, 1)
-        reward = batch[keys.NEXT, keys.LEARNED_REWARD]
-        batch[keys.NEXT, keys.LEARNED_REWARD] = reward - self.config.kl_penalty * away
-        return {"divergence": float(away.mean())}
 
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""
@@ -142,7 +126,3 @@ def _make_loss(
             normalize_advantage=True,
         )
     return ReinforceLoss(policy, value)
-
-
-def _log_prob(policy: ProbabilisticTensorDictSequential, steps: TensorDictBase) -> Tensor:
-    return policy.get_dist(steps.copy()).log_prob(steps[keys.ACTION])

@@ -21,7 +21,7 @@ def reseed(env: EnvBase, seed: int) -> None:
     for place, transform in enumerate(transforms):
         if callable(set_seed := getattr(transform, "set_seed", None)):
             set_seed(derive(seed, "transform", place) % 2**31)
-    if not any(map(fixes_scenes, transforms)) and not workers_fix_scenes(env):
+    if not any(map(fixes_scenes, transforms)):
         env.set_seed(derive(seed, "simulator") % 2**31)
 
 
@@ -34,10 +34,9 @@ def workers_fix_scenes(env: EnvBase) -> bool:
     """Whether transforms inside of workers begin episodes in scenes that they know."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
-    if not isinstance(env, BatchedEnvBase):
-        return False
-    worker = first_worker(env)
-    return any(map(fixes_scenes, transforms_of(worker))) or workers_fix_scenes(worker)
+    return isinstance(env, BatchedEnvBase) and any(
+        map(fixes_scenes, transforms_of(first_worker(env)))
+    )
 
 
 def sampler_stats(env: EnvBase) -> Metrics:

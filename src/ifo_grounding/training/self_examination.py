@@ -62,8 +62,6 @@ class SelfExaminationConfig:
     """Clipping range of the probability ratio."""
     entropy: float = 0.01
     """Weight of the entropy bonus, with ``ppo``."""
-    kl_penalty: float = 0.0
-    """Reward that each nat of divergence from the phase-1 policy costs."""
     value_warmup: int = 2
     """First iterations, of more, that train the value head alone."""
     grad_clip: float = 1.0
@@ -90,7 +88,7 @@ class SelfExaminationConfig:
         check_range(self, "select_episodes", "max_steps", least=1)
         check_range(self, "lr", "value_lr", "clip", "grad_clip", above=0)
         check_range(self, "gamma", "lmbda", least=0, most=1)
-        check_range(self, "entropy", "kl_penalty", "value_warmup", least=0)
+        check_range(self, "entropy", "value_warmup", least=0)
         check_range(self, "select_every", "evaluate_every", least=0)
         if self.value_warmup >= self.iterations:
             raise UserError(
@@ -119,8 +117,8 @@ def self_examine(
 
     Args:
         env: batched, without true instructions and rewards; its transforms choose instructions
-            and write ``("next", "learned_reward")``. Those around the workers of a ``SerialEnv`` or
-            ``ParallelEnv`` are seeded anew each iteration, those inside of a worker are not.
+            and write ``("next", "learned_reward")``. They are seeded anew each iteration, but for
+            those inside the workers of a ``SerialEnv`` or ``ParallelEnv``.
         policy: the phase-1 policy, a ``ProbabilisticActor``.
         value: estimates the learned return.
         config: algorithm and budget.
@@ -141,8 +139,7 @@ def self_examine(
 
     Raises:
         UserError: where the env exposes its true state, or has no learned reward, or where the best
-            policy is to be selected with ``adversarial`` but without ``held_out``, or with starts
-            inside of workers.
+            policy is to be selected with ``adversarial`` but without ``held_out``.
     """
     _check(env, config, adversarial, held_out)
     policy.eval()
@@ -172,7 +169,6 @@ def self_examine(
         batch = learner.collect()
         metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
         metrics |= sampler_stats(env)
-        metrics |= learner.penalise_divergence(batch)
         metrics |= learner.improve(batch, iteration)
         release_freed_memory()  # batches of distinct pictures differ in size and would pile up
         if adversarial:
@@ -206,10 +202,10 @@ def _check(
     written = [*env.full_reward_spec.keys(True, True), *observed]
     if keys.LEARNED_REWARD not in written:
         raise UserError("the env pays no learned reward: add LearnedReward or GoalReward")
-    if config.select_every and workers_fix_scenes(env):
+    if workers_fix_scenes(env):
         raise UserError(
-            "policies are compared on the same starts, and those inside of workers cannot be gone "
-            "back to: set select_every=0 to keep the last one, or do without workers"
+            "StartingPairs inside a worker cannot be seeded or gone back to: do without workers; "
+            "more rows (num_envs) are faster"
         )
     if config.select_every and adversarial is not None and held_out is None:
         raise UserError(
@@ -228,8 +224,6 @@ def _parts(
     """Return what a checkpoint has to keep."""
     parts: dict[str, Any] = {"policy": learner.policy, "value": learner.value}
     parts |= {"optimizer": learner.optimizer, "best": best}
-    if learner.reference is not None:
-        parts["reference"] = learner.reference
     if adversarial is not None:
         parts |= {"reward": adversarial.loss, "reward optimizer": adversarial.optimizer}
     starts = [transform for transform in transforms_of(env) if fixes_scenes(transform)]

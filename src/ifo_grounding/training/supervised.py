@@ -16,11 +16,18 @@ from torchrl.data import RandomSampler, ReplayBuffer
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.modules import beside, device_of
 from ifo_grounding.seeding import derive
-from ifo_grounding.training.captured import CapturedUpdate, Update, let_capture, set_rate
 from ifo_grounding.training.checkpoint import Checkpoint
 from ifo_grounding.training.early_stopping import BestWeights
 from ifo_grounding.training.loop import Log, Loop, Metrics
-from ifo_grounding.training.updates import decay_towards_origin, make_optimizer, update
+from ifo_grounding.training.updates import (
+    CapturedUpdate,
+    Update,
+    decay_towards_origin,
+    let_capture,
+    make_optimizer,
+    set_rate,
+    update,
+)
 
 SCHEDULES = ("constant", "cosine")
 

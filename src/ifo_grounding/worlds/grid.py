@@ -53,7 +53,7 @@ class Grid(World):
             if len(getattr(self, name)) != 2:
                 raise UserError(f"world.{name} is two numbers, got {list(getattr(self, name))}")
         grammar(self.task)
-        self.layout = Layout(self.size, tuple(self.objects), tuple(self.boxes), self.inside)
+        self.layout = Layout(self.size, (*self.objects,), (*self.boxes,), self.inside)
         self.actions, self.stop_action, self.vocabulary = keys.ACTIONS, keys.STOP, VOCABULARY
         self.oracle = GridOracle(self)
 

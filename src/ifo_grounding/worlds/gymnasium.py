@@ -44,11 +44,13 @@ class Gymnasium(World):
     def __post_init__(self) -> None:
         if (self.id is None) == (self.factory is None):
             raise UserError("name the world by one of world.id=... and world.factory=...")
+        if isinstance(self.stop, str) and self.stop != "add":
+            raise UserError(f"world.stop is a number of an action, add or null, got {self.stop!r}")
         world = self._maker()()
         count = getattr(world.action_space, "n", 0) + (self.stop == "add")
         world.close()
         self.actions = self.names or action_names(int(count))
-        self.stop_action = int(count) - 1 if self.stop == "add" else self.stop
+        self.stop_action = int(count) - 1 if isinstance(self.stop, str) else self.stop
 
     def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> GymnasiumEnv:
         """Return worlds without instructions and rewards; see :class:`World`."""
@@ -68,8 +70,8 @@ class Gymnasium(World):
         return self._worlds(num_envs, seed, stream, device, instructed=True)
 
     def _maker(self) -> Callable[[], gymnasium.Env]:
-        if self.id is not None:
-            return lambda: gymnasium.make(self.id, **self.make)
+        if self.factory is None:
+            return lambda: gymnasium.make(str(self.id), **self.make)
         try:
             factory = get_method(self.factory)
         except Exception as error:  # whatever the module raises as it is imported
