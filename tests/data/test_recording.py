@@ -8,7 +8,7 @@ import torch
 from ifo_grounding.data import Demonstrations, Truth, record_demonstrations, recording
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
-from ifo_grounding.tasks import TASKS, SceneOptions, SceneStream, achieved, grammar, suitable
+from ifo_grounding.tasks import TASKS, SceneOptions, SceneStream, achieved, grammar, verdict
 from ifo_grounding.tasks.grammar import in_split
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import Layout, render, step
@@ -25,7 +25,7 @@ def test_frames_show_the_actions_that_fulfil_the_instruction(task):
     demos, truth = record_demonstrations(task, 12, seed=3, keep_truth=True)
     scenes = scenes_of(task, 12, seed=3)
     goals = grammar(task).parse_tokens(demos.instructions)
-    assert suitable(scenes.state, goals).all()
+    assert not verdict(scenes.state, goals).any()
     actions = truth.actions.long().split((demos.lengths - 1).tolist())
     for number in range(12):
         state = scenes.state[number : number + 1]

@@ -11,7 +11,6 @@ from ifo_grounding.tasks import (
     TASKS,
     achieved,
     plan,
-    suitable,
     verdict,
 )
 from ifo_grounding.tasks.expert import act
@@ -43,7 +42,6 @@ def test_verdicts_are_those_of_the_plain_rules(asked, max_steps):
     found = [REASONS[number] for number in verdict(state, goal, max_steps).tolist()]
     pairs = zip(plain(state), wishes(goal), strict=True)
     assert found == [verdict_of(world, wish, max_steps) for world, wish in pairs]
-    assert suitable(state, goal, max_steps).tolist() == [reason == "suitable" for reason in found]
 
 
 @law

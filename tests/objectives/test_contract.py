@@ -125,20 +125,6 @@ def test_keys_of_networks_and_losses_can_be_nested(kind):
 
 
 @pytest.mark.parametrize("kind", ["inverse", "imitation", "reward"])
-def test_reductions(kind):
-    data = batch((3, 4))
-    results = {}
-    for reduction in ("mean", "sum", "none"):
-        torch.manual_seed(0)
-        results[reduction] = total(make_loss(kind, reduction=reduction)(data))
-    assert results["none"].shape == (3, 4)
-    torch.testing.assert_close(results["none"].mean(), results["mean"])
-    torch.testing.assert_close(results["none"].sum(), results["sum"])
-    with pytest.raises(UserError, match="unknown reduction"):
-        make_loss(kind, reduction="median")
-
-
-@pytest.mark.parametrize("kind", ["inverse", "imitation", "reward"])
 def test_padding_that_torchrl_marks_does_not_count(kind):
     loss = make_loss(kind).eval()
     data = batch((3, 4))

@@ -1,4 +1,4 @@
-"""What the losses share: one network, its mode while the loss computes, and reductions."""
+"""What the losses share: one network, its mode while the loss computes, and means."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError
 from ifo_grounding.modules import has_word_penalty, hidden_from_python, output_key
 
 
@@ -45,8 +45,6 @@ class SupervisedLoss(LossModule):
 
     Args:
         network: the network to train, used as it is: nothing is copied or made stateless.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over the losses of the samples. Metrics are
-            always means.
 
     Raises:
         UserError: where it is unclear which output of the network is to learn.
@@ -61,11 +59,10 @@ class SupervisedLoss(LossModule):
     written: str | None = None
     """How the output that is learned is named, where a network writes several."""
 
-    def __init__(self, network: TensorDictModule, *, reduction: str = "mean") -> None:
+    def __init__(self, network: TensorDictModule) -> None:
         super().__init__()
-        check_choice("reduction", reduction, ("mean", "sum", "none"))
         self.network = network
-        self.reduction = reduction
+        self.reduction = "mean"
         self.output = None if self.written is None else output_key(network, self.written)
 
     @property
@@ -111,7 +108,7 @@ class SupervisedLoss(LossModule):
 
     def _mean(self, values: Tensor, tensordict: TensorDictBase | None = None) -> Tensor:
         """Return the mean of a metric over the samples that a mask of TorchRL leaves."""
-        return self._reduce_loss(values.detach().float(), tensordict, reduction="mean")
+        return self._reduce_loss(values.detach().float(), tensordict)
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         """No value estimator: nothing to forward."""

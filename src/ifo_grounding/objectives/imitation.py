@@ -34,7 +34,6 @@ class ImitationLoss(SupervisedLoss):
     Args:
         network: a policy with ``get_dist``, such as ``make_policy`` or TorchRL's
             ``ProbabilisticActor`` give, or a ``TensorDictSequential`` that contains one.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         word_penalty: weight of ``loss_words``.
         words_from: share of training, see :meth:`set_progress`, before which words are neither
             penalised nor swapped. Where actions are easy to guess without words, they are otherwise
@@ -64,7 +63,6 @@ class ImitationLoss(SupervisedLoss):
         self,
         network: TensorDictModuleBase,
         *,
-        reduction: str = "mean",
         word_penalty: float = 0.02,
         words_from: float = 0.0,
     ) -> None:
@@ -74,7 +72,7 @@ class ImitationLoss(SupervisedLoss):
                 f"ProbabilisticActor give, or a TensorDictSequential with one in it, got "
                 f"{type(network).__name__}"
             )
-        super().__init__(network, reduction=reduction)
+        super().__init__(network)
         if not 0 <= words_from <= 1:
             raise UserError(f"words_from is a share of training in [0, 1], got {words_from}")
         words = ["loss_words"] if has_word_penalty(network) else []

@@ -21,7 +21,6 @@ class InverseLoss(SupervisedLoss):
 
     Args:
         network: two images to logits, as ``make_inverse`` builds it.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
 
     >>> import torch
     >>> from ifo_grounding.networks import Shapes, make_inverse

@@ -30,7 +30,6 @@ class RewardLoss(SupervisedLoss):
             ``make_reward_model`` builds it. With ``all_actions`` images are encoded once for both
             actions.
         n_actions: number of actions; networks of this library know theirs.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         generator: where random numbers come from; None is the global generator.
 
     >>> from ifo_grounding.networks import Shapes, make_reward_model
@@ -59,10 +58,9 @@ class RewardLoss(SupervisedLoss):
         network: TensorDictModule,
         *,
         n_actions: int | None = None,
-        reduction: str = "mean",
         generator: torch.Generator | None = None,
     ) -> None:
-        super().__init__(network, reduction=reduction)
+        super().__init__(network)
         known = getattr(getattr(network, "shapes", None), "n_actions", None)
         count = known if n_actions is None else n_actions
         if count is None:
@@ -94,21 +92,11 @@ class RewardLoss(SupervisedLoss):
 
         Args:
             demonstrations: transitions with labelled actions, as for :meth:`forward`.
-            policy: transitions with the policy's actions, of any batch size; as many as of
-                demonstrations, unless the loss is a mean.
+            policy: transitions with the policy's actions, of any batch size.
             smoothing: how far the targets are from 1 and 0, for the policy is often right.
-
-        Raises:
-            UserError: where the loss is no mean, and the two are not of one size.
         """
         self._require(demonstrations)
         self._require(policy)
-        if self.reduction != "mean" and policy.batch_size != demonstrations.batch_size:
-            raise UserError(
-                f"reduction={self.reduction!r} needs as many transitions of the policy as of "
-                f"demonstrations, got {list(policy.batch_size)} and "
-                f"{list(demonstrations.batch_size)}"
-            )
         with self._mode():
             right = self._scores(demonstrations, self._actions(demonstrations)).squeeze(-1)
             wrong = self._scores(policy, self._actions(policy)).squeeze(-1)

@@ -10,7 +10,6 @@ from ifo_grounding.tasks.goals import (
     achieved,
     fulfilled,
     plan,
-    suitable,
     verdict,
 )
 from ifo_grounding.tasks.grammar import HOLDOUTS, N_TEMPLATES, PHRASINGS, SPLITS, Grammar, grammar
@@ -39,6 +38,5 @@ __all__ = [
     "fulfilled",
     "grammar",
     "plan",
-    "suitable",
     "verdict",
 ]

@@ -145,11 +145,6 @@ def verdict(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Tensor
     return plan(state, goal, max_steps).verdict
 
 
-def suitable(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Tensor:
-    """Say whether a goal suits an initial state, bool [*B]; :func:`verdict` says why not."""
-    return verdict(state, goal, max_steps) == SUITABLE
-
-
 def fulfilled(final: WorldState, wanted: Plan) -> Tensor:
     """Say whether a state fulfils a resolved goal, bool [*B]."""
     resolved = (wanted.verdict == SUITABLE) | (wanted.verdict >= ALREADY_TRUE)
