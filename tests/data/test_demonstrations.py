@@ -436,10 +436,3 @@ def test_the_current_folder_is_not_replaced(demos, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="current folder"):
         demos.save(".")
     assert list(Path.cwd().iterdir()) == []
-
-
-def test_read_only_frames_are_read_without_a_warning(recwarn):
-    frames = np.zeros((3, 3, 8, 8), dtype=np.uint8)
-    frames.setflags(write=False)
-    assert len(Demonstrations.from_arrays([frames], ["go up"])) == 1
-    assert not [each for each in recwarn if "writable" in str(each.message)]

@@ -18,7 +18,7 @@ from ifo_grounding.networks import (
     make_reward_model,
     word_scoring,
 )
-from ifo_grounding.networks.cells import distinct_pairs, group_cells
+from ifo_grounding.networks.cells import distinct_pairs
 
 
 @pytest.fixture(scope="module")
@@ -75,21 +75,6 @@ def test_scenes_are_read_by_kinds_of_cells_as_cell_by_cell(make, scenes, monkeyp
     monkeypatch.setattr(word_scoring, "hidden_from_python", lambda tensor: True)
     assert network.encode_scenes(*images).features.shape[-1] == 36
     assert_same(found, outputs_and_gradients(network, *images))
-
-
-def test_groups_say_what_lies_where():
-    source = torch.Generator().manual_seed(0)
-    index, place = torch.randint(5, (7, 12), generator=source), torch.rand(12, 2, generator=source)
-    cell, number, mean = group_cells(index, place.expand(7, -1, -1))
-    assert number.sum(1).tolist() == [12] * 7
-    for row in range(7):
-        there = number[row] > 0
-        assert sorted(cell[row][there].tolist()) == index[row].unique().tolist()
-        for kind, count, where in zip(cell[row], number[row], mean[row], strict=True):
-            if count:
-                assert count == (index[row] == kind).sum()
-                torch.testing.assert_close(where, place[index[row] == kind].mean(0))
-    assert len(group_cells(index[:0], place.expand(0, -1, -1))[0]) == 0
 
 
 @pytest.mark.parametrize("size", [(48, 48), (44, 50)])

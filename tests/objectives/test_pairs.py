@@ -80,10 +80,6 @@ def test_the_nearest_are_found_once_for_each_instruction(monkeypatch):
     assert torch.equal(negatives._nearest(asked), found)
 
 
-def test_nothing_scored_nothing_dropped():
-    assert NegativeInstructions(POOL, 0.3).keep(torch.zeros(0)).shape == (0,)
-
-
 @pytest.mark.parametrize(
     ("pool", "options", "message"),
     [
