@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,18 +22,19 @@ OPTIONS = [
     "progress=false",
     "threads=1",
     "checkpoint_seconds=0",
+    *("imitate.steps=60", "imitate.iteration=2", "imitate.batch_size=64"),
 ]
 
 
-def start(name, run, *extra):
-    command = [sys.executable, str(recipes_folder() / f"{name}.py"), f"run={run}", *OPTIONS, *extra]
+def start(name, run):
+    command = [sys.executable, str(recipes_folder() / f"{name}.py"), f"run={run}", *OPTIONS]
     return subprocess.Popen(
         command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL
     )
 
 
-def finish(name, run, *extra):
-    assert start(name, run, *extra).wait() == 0
+def finish(name, run):
+    assert start(name, run).wait() == 0
 
 
 @pytest.fixture
@@ -49,16 +51,13 @@ def last_saved(run) -> int:
 
 
 def test_sigkill_changes_nothing(prepared, tmp_path):
-    import shutil
-
-    steps = ["imitate.steps=60", "imitate.iteration=2", "imitate.batch_size=64"]
     whole = tmp_path / "whole"
     shutil.copytree(prepared, whole)
-    finish("imitate", whole, *steps)
+    finish("imitate", whole)
     draw = random.Random(0)
     killed = 0
     for _ in range(3):
-        process = start("imitate", prepared, *steps)
+        process = start("imitate", prepared)
         deadline = time.monotonic() + 120
         before = last_saved(prepared)
         while process.poll() is None and time.monotonic() < deadline:
@@ -69,7 +68,7 @@ def test_sigkill_changes_nothing(prepared, tmp_path):
         process.send_signal(signal.SIGKILL)
         killed += process.wait() == -signal.SIGKILL
     assert killed
-    finish("imitate", prepared, *steps)
+    finish("imitate", prepared)
     name = "policy-phase1.safetensors"
     weights, expected = load_file(prepared / name), load_file(whole / name)
     assert weights.keys() == expected.keys()

@@ -64,6 +64,7 @@ def make_policy(
             one-hot actions.
 
     >>> from tensordict import TensorDict
+    >>> from ifo_grounding.networks import Shapes
     >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> step = policy(TensorDict({
     ...     "pixels": torch.zeros(2, 3, 48, 48, dtype=torch.uint8),
@@ -125,6 +126,7 @@ def make_value(
         UserError: for an unknown preset or option, sizes that cannot be read, or a policy whose
             trunk does not fit.
 
+    >>> from ifo_grounding.networks import Shapes
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
     >>> value = make_value(shapes, init_from=make_policy(shapes, seed=0), seed=0)
     >>> value(pixels=torch.zeros(2, 3, 48, 48), instruction=torch.ones(2, 16)).shape
@@ -156,6 +158,7 @@ def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Te
     Returns:
         Weights, float32 [N, M, h, w], which sum to 1 over the cells of a map.
 
+    >>> from ifo_grounding.networks import Shapes
     >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> words = torch.ones(2, 16, dtype=torch.int64)
     >>> attention_maps(policy, torch.zeros(2, 3, 48, 48), words).shape

@@ -63,6 +63,7 @@ def make_reward_model(
         UserError: for an unknown preset or option, sizes that cannot be read, or a policy that
             does not fit.
 
+    >>> from ifo_grounding.networks import Shapes
     >>> rwd = make_reward_model(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), torch.ones(2, 16)
     >>> rwd(pixels=image, instruction=words, action=torch.tensor([0, 5])).shape
