@@ -122,6 +122,16 @@ def test_a_run_goes_on_with_its_own_options(tmp_path):
     Run(same.run).begin(plain(same), FREE)
 
 
+def test_a_run_of_another_version_says_so(tmp_path):
+    values = plain(options_of(f"run={tmp_path / 'run'}"))
+    values["imitate"]["momentum"] = 0.9
+    Run(tmp_path / "run").begin(values, FREE)
+    with pytest.raises(
+        UserError, match=r"imitate\.momentum, which this version does not"
+    ):
+        options_of(f"run={tmp_path / 'run'}")
+
+
 def test_every_option_says_what_it_means():
     for name, kind in sections().items():
         docs = field_docs(kind)

@@ -90,6 +90,13 @@ def _demonstrations(cfg: DictConfig) -> int:
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Sequence[str]) -> DictConfig:
     """Return a run's options, but for those that are free and those that a command names."""
+    known = {name for name, _ in _leaves(plain(cfg))}
+    for name in (name for name, _ in _leaves(made) if not name.startswith("world.")):
+        if name not in known:
+            raise UserError(
+                f"{cfg.run} was made with the option {name}, which this version does not have: "
+                "give another run=, or go on with the version that made it"
+            )
     result = OmegaConf.create({**plain(cfg), **made})
     for name in [*FREE, *named]:
         if not name.startswith("hydra"):
