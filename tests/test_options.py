@@ -126,9 +126,7 @@ def test_a_run_of_another_version_says_so(tmp_path):
     values = plain(options_of(f"run={tmp_path / 'run'}"))
     values["imitate"]["momentum"] = 0.9
     Run(tmp_path / "run").begin(values, FREE)
-    with pytest.raises(
-        UserError, match=r"imitate\.momentum, which this version does not"
-    ):
+    with pytest.raises(UserError, match=r"imitate\.momentum, which this version does not"):
         options_of(f"run={tmp_path / 'run'}")
 
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
+from ifo_grounding.options import options_of
 from importing import recipes_importable
 
 pytestmark = pytest.mark.browser
@@ -23,19 +24,15 @@ FLAGS = ["--no-sandbox", "--disable-background-networking", "--disable-component
 @pytest.fixture(scope="module")
 def page_of_a_run(tmp_path_factory):
     """The report of both phases, made by the recipes."""
-    from hydra import compose, initialize_config_dir
-
     run = tmp_path_factory.mktemp("browser") / "run"
-    with recipes_importable() as folder:
+    with recipes_importable():
         from two_phase import two_phase
 
         from report import report
 
-        with initialize_config_dir(version_base=None, config_dir=str(folder / "conf")):
-            options = compose(
-                "two_phase",
-                ["task=pick", "budget=tiny", f"run={run}", "progress=false", "threads=1"],
-            )
+        options = options_of(
+            "task=pick", "budget=tiny", f"run={run}", "progress=false", "threads=1"
+        )
         two_phase(options)
         return report(options)
 
