@@ -55,13 +55,13 @@ def open_run(options: Options) -> Run:
     Raises:
         UserError: where it was made with other options.
     """
-    world_of(options)  # what is wrong with it is said before anything begins
     keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
     if options.threads:
         torch.set_num_threads(options.threads)
     run = Run(options.run, options.logger)
     if run.folder not in _OPEN:
+        world_of(options)  # what is wrong with it is said before anything begins
         _LOCKS.enter_context(run.lock())  # until this process ends
         _OPEN.add(run.folder)
     if options.base:

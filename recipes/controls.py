@@ -3,10 +3,9 @@
 import math
 from dataclasses import replace
 
-from _shared import CONTINUED, POLICIES, learn, load_network, open_stage, simulator_of, tell
+from _shared import CONTINUED, POLICIES, learn, load_network, open_stage, tell
 from imitate import labelled_demonstrations
-from self_examine import adversarial_updates, chosen_starts, held_out_accuracy, learned_reward
-from torchrl.envs import Compose, TransformedEnv
+from self_examine import adversarial_updates, held_out_accuracy, learned_reward, paid_simulator
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
@@ -26,10 +25,8 @@ def continue_imitation(options: Options) -> dict:
     best = None
     if section.select_every:
         reward = learned_reward(run, options)
-        transforms = Compose(chosen_starts(run, options), reward)
-        env = TransformedEnv(simulator_of(options, section.num_envs), transforms)
         best = BestCheckpoint(
-            env,
+            paid_simulator(reward, run, options),
             policy,
             seed=options.seed,
             episodes=section.select_episodes,

@@ -10,13 +10,12 @@ from _shared import (
     POLICIES,
     REWARD,
     chosen_by,
-    evaluation_scenes,
     load_demonstrations,
     load_network,
     open_run,
     world_of,
 )
-from evaluate import UNTIL_THE_END, evaluate
+from evaluate import evaluate, played
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
@@ -87,9 +86,8 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
 
 def recorded(policy: Any, scenes: list[int], options: Options, tile_size: int | None) -> list:
     """Play the evaluation scenes of these numbers, to look at."""
-    where = evaluation_scenes(options)
-    env = world_of(options).instructed(len(scenes), device=options.device, **where)
-    how = {"seed": where["seed"], "stream": where["stream"], "max_steps": UNTIL_THE_END}
+    env, how = played(options, len(scenes))
+    how.pop("episodes")  # scenes are named
     return record_episodes(policy, env, scenes, render_tile_size=tile_size, **how)
 
 

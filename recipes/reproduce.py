@@ -6,7 +6,7 @@ python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import product
@@ -21,6 +21,7 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.training import Run
+from ifo_grounding.training.checkpoint import leaves
 
 WANTED = {
     ("table", 2): ("phase-1", "pairs-5000", "pairs-10000"),
@@ -176,18 +177,9 @@ def call(
     path = Path(options.results) / file
     given = {"run": run, "results": str(path.parent), "device": options.device}
     for section in chosen:
-        given |= dict(flat(section))
+        given |= leaves(section)
     arguments = (f"{name}={'null' if value is None else value}" for name, value in given.items())
     return Piece(run, tuple(arguments), path, base)
-
-
-def flat(section: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield options by their full names."""
-    for name, value in section.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{above}{name}.")
-        else:
-            yield f"{above}{name}", value
 
 
 def to_make(chain: list[Piece]) -> list[Piece]:

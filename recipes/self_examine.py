@@ -23,7 +23,7 @@ from _shared import (
 from evaluate import audit_callback
 from imitate import labelled_demonstrations
 from torchrl.data import ReplayBuffer
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from ifo_grounding import networks
 from ifo_grounding.cli import recipe_main
@@ -52,8 +52,7 @@ def examine(options: Options) -> dict:
     value = build(make_value, options, init_from=policy, context=options.imitate.context)
     # Where: states of the simulator with chosen instructions, paid by what was learned.
     reward = learned_reward(run, options)
-    simulator = simulator_of(options, section.num_envs)
-    env = TransformedEnv(simulator, Compose(chosen_starts(run, options), reward))
+    env = paid_simulator(reward, run, options)
     # What demonstrations add: an imitation loss beside the reward, and accuracy on those held out.
     seen, aside = labelled_demonstrations(run, options.imitate.held_out)
     weight = section.imitation_weight
@@ -75,6 +74,12 @@ def examine(options: Options) -> dict:
     )
     networks.save(policy, run / POLICIES["phase2"])
     return finish(options, stage, history[-1], history)
+
+
+def paid_simulator(reward: LearnedReward | GoalReward, run: Run, options: Options) -> EnvBase:
+    """Return the simulator with chosen instructions and a learned reward."""
+    simulator = simulator_of(options, options.self_examine.num_envs)
+    return TransformedEnv(simulator, Compose(chosen_starts(run, options), reward))
 
 
 def learned_reward(run: Run, options: Options) -> LearnedReward | GoalReward:

@@ -35,6 +35,13 @@ def innermost(env: Any) -> Any:
     return env
 
 
+def untransformed(env: EnvBase) -> EnvBase:
+    """Return the environment that all transforms are around: a batch of workers stays one."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
 def first_worker(env: BatchedEnvBase) -> EnvBase:
     """Return an environment as that of a batch's first worker, made here: processes stay apart."""
     if env not in _FIRST_WORKERS:

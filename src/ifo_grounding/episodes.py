@@ -8,10 +8,11 @@ from typing import NamedTuple
 import torch
 from tensordict import TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
 
 from ifo_grounding import keys
+from ifo_grounding.attributes import untransformed
 from ifo_grounding.errors import UserError, check_choice
 
 MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
@@ -157,6 +158,4 @@ def _steps_on(env: EnvBase) -> bool:
 
     That spares new scenes for rows that count no more; others are reset.
     """
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return getattr(type(env), "steps_on", False)
+    return getattr(type(untransformed(env)), "steps_on", False)

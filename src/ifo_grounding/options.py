@@ -22,6 +22,7 @@ from ifo_grounding.config import FREE, Options, register
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.data.listing import LIST, read_list
 from ifo_grounding.errors import UserError, did_you_mean
+from ifo_grounding.training.checkpoint import leaves
 from ifo_grounding.training.run import Run
 
 FEW = 1000
@@ -60,7 +61,7 @@ def current(cfg: DictConfig) -> Options:
 def settled(cfg: DictConfig, overrides: Sequence[str]) -> Options:
     """Return composed options as dataclasses: those of the run, where it has begun.
 
-    With fewer demonstrations than :data:`~ifo_grounding.config.FEW` the budget of ``strong`` is
+    With fewer demonstrations than :data:`FEW` the budget of ``strong`` is
     ``few``, unless one is named. What a run was made with wins over what a command does not name,
     but for what decides nothing of what it learns (:data:`~ifo_grounding.config.FREE`); what it
     names otherwise is refused where the run is opened.
@@ -90,9 +91,9 @@ def _demonstrations(cfg: DictConfig) -> int:
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Sequence[str]) -> DictConfig:
     """Return a run's options, but for those that are free and those that a command names."""
-    known = {name for name, _ in _leaves(plain(cfg))}
-    for name in (name for name, _ in _leaves(made) if not name.startswith("world.")):
-        if name not in known:
+    known = leaves(plain(cfg))
+    for name in leaves(made):
+        if name not in known and not name.startswith("world."):
             raise UserError(
                 f"{cfg.run} was made with the option {name}, which this version does not have: "
                 "give another run=, or go on with the version that made it"
@@ -121,7 +122,7 @@ def typed(cfg: DictConfig) -> Options:
             except UserError as error:
                 raise UserError(_placed(str(error), field.name)) from None
         options[field.name] = value
-    for name, value in _leaves(values):
+    for name, value in leaves(values).items():
         if isinstance(value, int) and abs(value) > LARGEST and not name.endswith("seed"):
             raise UserError(f"{name} must be at most {LARGEST:,}, got {value}")
     return Options(**options)
@@ -138,14 +139,6 @@ def plain(node: Any) -> Any:
     if dataclasses.is_dataclass(node) and not isinstance(node, type):
         return dataclasses.asdict(node)
     return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
-
-
-def _leaves(values: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{above}{name}.")
-        else:
-            yield f"{above}{name}", value
 
 
 def _refuse_unknown(cfg: DictConfig) -> None:

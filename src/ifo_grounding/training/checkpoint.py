@@ -38,7 +38,7 @@ def difference(
     'made with imitate.steps=900, not 10: leave it out'
     >>> difference({"imitate": {"steps": 900}}, {"imitate": {"steps": 10}}, free=["imitate"])
     """
-    before, now = _leaves(made), _leaves(asked)
+    before, now = leaves(made), leaves(asked)
     for name in dict.fromkeys([*before, *now]):
         if any(name == each or name.startswith(f"{each}.") for each in free):
             continue
@@ -52,12 +52,12 @@ def difference(
     return None
 
 
-def _leaves(settings: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-    """Return all settings that are no sections by their dotted names."""
+def leaves(settings: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """Return all settings that are no sections by their dotted names, such as ``imitate.lr``."""
     found: dict[str, Any] = {}
     for name, value in settings.items():
         if isinstance(value, Mapping):
-            found |= _leaves(value, f"{section}{name}.")
+            found |= leaves(value, f"{section}{name}.")
         else:
             found[f"{section}{name}"] = list(value) if isinstance(value, tuple) else value
     return found

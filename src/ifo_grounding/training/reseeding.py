@@ -8,7 +8,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.transforms import Transform
 
-from ifo_grounding.attributes import first_worker
+from ifo_grounding.attributes import first_worker, untransformed
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.loop import Metrics
 from ifo_grounding.transforms.base import parts_of
@@ -32,8 +32,7 @@ def fixes_scenes(transform: nn.Module) -> bool:
 
 def workers_fix_scenes(env: EnvBase) -> bool:
     """Whether transforms inside of workers begin episodes in scenes that they know."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
+    env = untransformed(env)
     return isinstance(env, BatchedEnvBase) and any(
         map(fixes_scenes, transforms_of(first_worker(env)))
     )

@@ -8,9 +8,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 
+from ifo_grounding.attributes import untransformed
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
 from ifo_grounding.mosaic import PIXELS_PER_WORD, as_words
@@ -152,8 +153,7 @@ class StartingPairs(InstructionTransform):
     def check_env(self, env: EnvBase) -> None:
         """Raise :class:`UserError` where an environment does not suit."""
         super().check_env(env)
-        while isinstance(env, TransformedEnv):
-            env = env.base_env
+        env = untransformed(env)
         if isinstance(env, BatchedEnvBase):
             raise UserError(
                 f"{type(self).__name__} cannot reach the simulators through a "

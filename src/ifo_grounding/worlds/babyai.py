@@ -59,14 +59,19 @@ class BabyAI(World):
             seed=seed,
             stream=stream,
             tile_size=self.tile_size,
-            processes=self.processes or os.cpu_count() or 1,
+            processes=self._processes,
             progress=progress,
         )
 
     def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
         """Return the bot's own success."""
-        processes = self.processes or os.cpu_count() or 1
-        return bot_outcomes(self.level, episodes, seed=seed, stream=stream, processes=processes)
+        return bot_outcomes(
+            self.level, episodes, seed=seed, stream=stream, processes=self._processes
+        )
+
+    @property
+    def _processes(self) -> int:
+        return self.processes or os.cpu_count() or 1
 
     def _rooms(
         self, num_envs: int, seed: int, stream: str, mission: str, device: str
