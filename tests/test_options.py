@@ -104,6 +104,8 @@ def test_few_demonstrations_take_a_budget_of_their_own_unless_one_is_named(tmp_p
     assert imitate("demonstrations.n=999", "preset=paper") == ("demo", 999, 128)
     record_demonstrations("move", 40, seed=0).save(tmp_path / "shown")
     assert imitate(f"recorded={tmp_path / 'shown'}") == ("few", 40, 64)
+    record_demonstrations("move", 250, seed=0).save(tmp_path / "more")  # than few would record
+    assert imitate(f"recorded={tmp_path / 'more'}") == ("few", 250, 64)
 
 
 def test_a_run_goes_on_with_its_own_options(tmp_path):

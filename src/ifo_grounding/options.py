@@ -68,10 +68,10 @@ def settled(cfg: DictConfig, overrides: Sequence[str]) -> Options:
     """
     _refuse_unknown(cfg)
     named = [each.key_or_group for each in OverridesParser.create().parse_overrides([*overrides])]
-    fewer = _demonstrations(cfg) < FEW
-    if fewer and cfg.preset == "strong" and "budget" not in named:
+    number = _demonstrations(cfg)
+    if number < FEW and cfg.preset == "strong" and "budget" not in named:
         cfg = compose(CONFIG, [*overrides, "budget=few"])
-    cfg.demonstrations.n = _demonstrations(cfg)
+    cfg.demonstrations.n = number  # all that were recorded, not as many as the budget would record
     made = Run(cfg.run).options()
     return typed(cfg if made is None else _goes_on(cfg, made, named))
 
