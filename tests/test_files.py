@@ -1,6 +1,5 @@
 """Files that are there as a whole or not at all."""
 
-import json
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -13,11 +12,13 @@ from ifo_grounding.files import atomic_write, read_json, write_json
 
 def test_what_is_not_finite_becomes_null(tmp_path):
     write_json(tmp_path / "file", {"b": [math.nan, 1.5], "a": (math.inf, True), "c": "nan"})
-    assert json.loads((tmp_path / "file").read_text()) == {
-        "a": [None, True],
-        "b": [None, 1.5],
-        "c": "nan",
-    }
+    assert read_json(tmp_path / "file") == {"a": [None, True], "b": [None, 1.5], "c": "nan"}
+
+
+def make_folder(path, then=lambda: None):
+    with atomic_write(path) as temporary:
+        temporary.mkdir()
+        then()
 
 
 @pytest.mark.parametrize("moves", [0, 1])
@@ -33,26 +34,16 @@ def test_an_interrupted_replacement_leaves_the_old_folder(tmp_path, monkeypatch,
             raise KeyboardInterrupt
         done.append(replace(source, target))
 
-    def write():
-        with atomic_write(folder) as temporary:
-            temporary.mkdir()
-            monkeypatch.setattr(os, "replace", interrupted)
-
     with pytest.raises(KeyboardInterrupt):
-        write()
+        make_folder(folder, lambda: monkeypatch.setattr(os, "replace", interrupted))
     assert [path.name for path in tmp_path.iterdir()] == ["kept"]
     assert (folder / "old").exists()
 
 
 def test_a_folder_does_not_take_the_place_of_a_file(tmp_path):
     (tmp_path / "file").write_text("mine")
-
-    def write():
-        with atomic_write(tmp_path / "file") as temporary:
-            temporary.mkdir()
-
     with pytest.raises(NotADirectoryError):
-        write()
+        make_folder(tmp_path / "file")
     assert (tmp_path / "file").read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 

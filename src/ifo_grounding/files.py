@@ -27,11 +27,7 @@ def home() -> Path:
 
 
 def regular_file(path: Path) -> Path:
-    """Return a path that is read next, which must be a regular file: no folder, no pipe.
-
-    Raises:
-        OSError: where it is another thing, or not there.
-    """
+    """Return a path that is read next; what is no regular file, as a pipe, is an OSError."""
     if not path.is_file():
         raise OSError(f"{path} is no regular file")
     return path
@@ -67,12 +63,12 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
 def _replace_folder(temporary: Path, path: Path) -> None:
     """Give a folder the name of another, which goes; of several writers the last one stays."""
-    retired: list[Path] = []
+    retired = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old")
+    retired.mkdir()
     try:
         for patience in range(WRITERS, -1, -1):
-            retired.append(path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old"))
             with contextlib.suppress(FileNotFoundError):
-                os.replace(path, retired[-1])
+                os.replace(path, retired / str(patience))
             try:
                 os.replace(temporary, path)
                 return
@@ -80,15 +76,10 @@ def _replace_folder(temporary: Path, path: Path) -> None:
                 if not patience or error.errno not in TAKEN:
                     raise
     finally:
-        for old in filter(Path.exists, reversed(retired)):
-            try:
-                if not path.exists():  # interrupted between the two, the old one comes back
-                    os.replace(old, path)
-                    continue
-            except OSError as error:
-                if error.errno not in TAKEN:
-                    raise
-            shutil.rmtree(old, ignore_errors=True)
+        if temporary.exists() and not path.exists():  # interrupted: the old one comes back
+            for old in [*retired.iterdir()][-1:]:
+                os.replace(old, path)
+        shutil.rmtree(retired, ignore_errors=True)
 
 
 def write_json(path: str | Path, content: Any) -> None:
@@ -99,8 +90,8 @@ def write_json(path: str | Path, content: Any) -> None:
 
 
 def _finite(content: Any) -> Any:
-    if isinstance(content, float):
-        return content if math.isfinite(content) else None
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
     if isinstance(content, Mapping):
         return {key: _finite(value) for key, value in content.items()}
     return [_finite(value) for value in content] if isinstance(content, (list, tuple)) else content
