@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -14,22 +15,33 @@ from ifo_grounding.data.codec import FrameCodec
 FRAME_KEYS: tuple[NestedKey, ...] = (keys.PIXELS, (keys.NEXT, keys.PIXELS))
 
 
-class _Table(Transform):
-    """Looks something up in a table when a replay buffer is sampled, where the table is.
+class Lookup(Transform):
+    """Replaces row numbers by rows of a table when a replay buffer is sampled, where the table is.
 
     ``buffer.transform.to(device)`` moves the table, and samples follow it.
+
+    Args:
+        table: [N, *S].
+        in_keys: entries with row numbers, integer [*B].
+        out_keys: where the rows go, [*B, *S]; by default the same entries.
+
+    >>> import torch
+    >>> from tensordict import TensorDict
+    >>> lookup = Lookup(torch.tensor([[5, 6], [7, 8]]), in_keys=["instruction"])
+    >>> lookup(TensorDict({"instruction": torch.tensor([1, 1, 0])}, [3]))["instruction"].tolist()
+    [[7, 8], [7, 8], [5, 6]]
     """
+
+    table: Any
+    """[N, *S]; None where what a decoder reads are the pixels."""
 
     def __init__(
         self,
         table: Tensor | None,
         in_keys: Sequence[NestedKey],
-        out_keys: Sequence[NestedKey] | None,
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(
-            in_keys=list(in_keys), out_keys=list(in_keys if out_keys is None else out_keys)
-        )
-        self.table: Tensor | None
+        super().__init__(in_keys=[*in_keys], out_keys=[*(out_keys or in_keys)])
         self.register_buffer("table", table, persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -42,8 +54,11 @@ class _Table(Transform):
             return super().forward(tensordict.clone(recurse=False))
         return super().forward(tensordict.to(self.table.device))
 
+    def _apply_transform(self, number: Tensor) -> Tensor:
+        return self.table[number.to(self.table.device).long()]
 
-class FrameDecoder(_Table):
+
+class FrameDecoder(Lookup):
     """Decodes frames when a replay buffer is sampled.
 
     The buffer stores codes of a :class:`~ifo_grounding.data.FrameCodec`. Where it stores numbers of
@@ -75,35 +90,6 @@ class FrameDecoder(_Table):
         self.codec = codec
 
     def _apply_transform(self, codes: Tensor) -> Tensor:
-        if self.table is None:  # the codes are the pixels
+        if self.table is None:
             return codes
         return mosaic.assemble(self.table, codes.to(self.table.device))
-
-
-class Lookup(_Table):
-    """Replaces row numbers by rows of a table when a replay buffer is sampled.
-
-    Args:
-        table: [N, *S].
-        in_keys: entries with row numbers, integer [*B].
-        out_keys: where the rows go, [*B, *S]; by default the same entries.
-
-    >>> import torch
-    >>> from tensordict import TensorDict
-    >>> lookup = Lookup(torch.tensor([[5, 6], [7, 8]]), in_keys=["instruction"])
-    >>> lookup(TensorDict({"instruction": torch.tensor([1, 1, 0])}, [3]))["instruction"].tolist()
-    [[7, 8], [7, 8], [5, 6]]
-    """
-
-    table: Tensor
-
-    def __init__(
-        self,
-        table: Tensor,
-        in_keys: Sequence[NestedKey],
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
-        super().__init__(table, in_keys, out_keys)
-
-    def _apply_transform(self, number: Tensor) -> Tensor:
-        return self.table[number.to(self.table.device).long()]
