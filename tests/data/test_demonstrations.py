@@ -331,7 +331,7 @@ DAMAGE = {
     "bad json": (lambda f: (f / "meta.json").write_text("{"), "meta.json is not valid JSON"),
     "other kind": (lambda f: edit(f, lambda m: m.update(format="hats")), "holds 'hats', not"),
     "version": (lambda f: edit(f, lambda m: m.update(version=9)), "version 9, this library"),
-    "no arrays": (lambda f: edit(f, lambda m: m.pop("arrays")), "lacks its arrays"),
+    "no arrays": (lambda f: edit(f, lambda m: m.pop("arrays")), "is damaged: 'arrays'"),
     "unlisted": (lambda f: edit(f, lambda m: m["arrays"].pop("lengths")), "does not list lengths"),
     "no entry": (lambda f: edit(f, lambda m: m["arrays"].update(codes=3)), "is damaged"),
     "missing file": (lambda f: (f / "codes.npy").unlink(), "codes.npy is missing"),

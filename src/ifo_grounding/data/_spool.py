@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import IO
 
 import torch
@@ -40,14 +40,26 @@ class Spool:
         """Add rows, of any type of integer."""
         self._waiting.append(piece)
         self._bytes += piece.nbytes
-        if self._bytes > MEMORY_BYTES:
-            self._write()
+        if self._bytes <= MEMORY_BYTES:
+            return
+        if self._file is None:
+            home().mkdir(parents=True, exist_ok=True)
+            self._file = tempfile.TemporaryFile(dir=home())  # noqa: SIM115  it lives on
+        for each in self._waiting:
+            self._file.write(each.contiguous().numpy().data)
+            self._written.append((each.shape, each.dtype))
+        self._waiting.clear()
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Spool:
         """Move all pieces to another spool, changed; this one is empty afterwards."""
         changed = Spool()
-        for piece in self._drain():
-            changed.append(function(piece))
+        if self._file is not None:
+            self._file.seek(0)
+            for shape, dtype in self._written:
+                content = bytearray(self._file.read(shape.numel() * dtype.itemsize))
+                changed.append(function(torch.frombuffer(content, dtype=dtype).view(shape)))
+        while self._waiting:
+            changed.append(function(self._waiting.pop(0)))
         return changed
 
     def tensor(self, dtype: torch.dtype) -> Tensor:
@@ -60,24 +72,6 @@ class Spool:
         self._file.flush()
         mapping = mmap.mmap(self._file.fileno(), 0)  # it keeps the file
         return torch.frombuffer(mapping, dtype=dtype).view(rows, *self._written[0][0][1:])
-
-    def _write(self) -> None:
-        if self._file is None:
-            home().mkdir(parents=True, exist_ok=True)
-            self._file = tempfile.TemporaryFile(dir=home())  # noqa: SIM115  it lives on
-        for piece in self._waiting:
-            self._file.write(piece.contiguous().numpy().data)
-            self._written.append((piece.shape, piece.dtype))
-        self._waiting.clear()
-
-    def _drain(self) -> Iterator[Tensor]:
-        if self._file is not None:
-            self._file.seek(0)
-            for shape, dtype in self._written:
-                content = bytearray(self._file.read(shape.numel() * dtype.itemsize))
-                yield torch.frombuffer(content, dtype=dtype).view(shape)
-        while self._waiting:
-            yield self._waiting.pop(0)
 
 
 def join(parts: list[Tensor], dtype: torch.dtype) -> Tensor:
