@@ -194,7 +194,7 @@ def test_the_command_starts_without_torch():
 
 
 def test_extras_are_imported_only_when_they_are_used():
-    extras = ("av", "datasets", "h5py", "huggingface_hub", "imageio", "minari", "pyarrow", "pygame")
+    extras = ("av", "datasets", "h5py", "huggingface_hub", "minari", "pyarrow", "pygame")
     code = f"import sys, ifo_grounding.data; sys.exit(str({set(extras)} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.stderr.strip() == "set()"

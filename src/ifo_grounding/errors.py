@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import importlib
 import math
 import operator
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import fields
-from typing import Any, SupportsFloat
+from typing import Any
 
 
 class UserError(ValueError):
@@ -29,28 +30,15 @@ def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
 
 
 def whole(name: str, value: object) -> int:
-    """Return a whole number, or refuse what is none.
-
-    >>> whole("n", 1e3)
-    Traceback (most recent call last):
-    ifo_grounding.errors.UserError: n must be a whole number, got 1000.0
-    """
-    try:
-        number = operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool):
-        raise UserError(f"{name} must be a whole number, got {value!r}")
-    return number
+    """Return a whole number, or refuse what is none, such as 1e3 or True."""
+    if not isinstance(value, bool):
+        with contextlib.suppress(TypeError):
+            return operator.index(value)  # type: ignore[arg-type]
+    raise UserError(f"{name} must be a whole number, got {value!r}")
 
 
 def at_least_one(name: str, value: object) -> int:
-    """Return a whole number that counts something, or refuse what is none.
-
-    >>> at_least_one("batch_size", 0)
-    Traceback (most recent call last):
-    ifo_grounding.errors.UserError: batch_size must be at least 1, got 0
-    """
+    """Return a whole number that counts something, or refuse what is none."""
     number = whole(name, value)
     if number < 1:
         raise UserError(f"{name} must be at least 1, got {number}")
@@ -62,23 +50,19 @@ def check_numbers(config: Any, unbounded: Iterable[str] = ()) -> None:
 
     Those of NumPy and PyTorch become Python's, which a checkpoint can hold. Only what is named
     ``unbounded`` may be infinite.
-
-    Raises:
-        UserError: with the name of the first of them.
     """
     for field in fields(config):
         value = getattr(config, field.name)
-        if field.type in ("int", "int | None", "float") and getattr(value, "shape", None) == ():
+        if getattr(value, "shape", None) == ():
             value = value.item()
             object.__setattr__(config, field.name, value)  # of a frozen one, too
         if field.type == "int" or (field.type == "int | None" and value is not None):
             whole(field.name, value)
-        elif field.type == "float" and (
-            isinstance(value, bool | str) or not isinstance(value, SupportsFloat) or value != value
-        ):
-            raise UserError(f"{field.name} must be a number, got {value!r}")
-        elif field.type == "float" and math.isinf(value) and field.name not in unbounded:
-            raise UserError(f"{field.name} must be finite")
+        elif field.type == "float":
+            if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+                raise UserError(f"{field.name} must be a number, got {value!r}")
+            if math.isinf(value) and field.name not in unbounded:
+                raise UserError(f"{field.name} must be finite")
 
 
 def check_range(
@@ -117,16 +101,14 @@ def did_you_mean(given: str, allowed: Iterable[str]) -> str:
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
-@contextlib.contextmanager
-def extra(name: str, why: str) -> Iterator[None]:
-    """Say how to install what an optional part needs, where importing it fails.
+def optional(module: str, extra: str) -> Any:
+    """Import a module that an extra installs, or say how to install it.
 
-    >>> with extra("video", "videos need a library"):
-    ...     import no_such_library
+    >>> optional("no_such_library", extra="video")
     Traceback (most recent call last):
-    ifo_grounding.errors.UserError: videos need a library: pip install 'ifo-grounding[video]'
+    ifo_grounding.errors.UserError: no_such_library is missing: pip install 'ifo-grounding[video]'
     """
     try:
-        yield
+        return importlib.import_module(module)
     except ImportError:
-        raise UserError(f"{why}: pip install 'ifo-grounding[{name}]'") from None
+        raise UserError(f"{module} is missing: pip install 'ifo-grounding[{extra}]'") from None

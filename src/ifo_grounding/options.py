@@ -20,7 +20,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from ifo_grounding.cli import recipes_folder
 from ifo_grounding.config import FREE, Options, register
 from ifo_grounding.data import Demonstrations
-from ifo_grounding.data.listing import LIST, read_list
+from ifo_grounding.data.pictures import LIST, read_list
 from ifo_grounding.errors import UserError, did_you_mean
 from ifo_grounding.training.checkpoint import leaves
 from ifo_grounding.training.run import Run

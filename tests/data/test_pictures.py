@@ -1,8 +1,8 @@
 import json
 import os
 import random
-import shutil
 import struct
+from io import BytesIO
 
 import av
 import numpy as np
@@ -17,42 +17,51 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
 
 
+def picture(path, value, size=(24, 16), mode="RGB"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((size[1], size[0], 3), value, np.uint8)).convert(mode).save(path)
+
+
+def line(name, instruction="go", **more):
+    return json.dumps({"episode": name, "instruction": instruction, **more}).encode()
+
+
+def list_of(folder, *names):
+    (folder / "episodes.jsonl").write_bytes(b"\n".join(map(line, names)))
+
+
+def write(folder, *names):
+    """Write episodes of two frames."""
+    for name in names:
+        for step in range(2):
+            picture(folder / name / f"{step}.png", step)
+    list_of(folder, *names)
+
+
+def make_video(path, frames=20, size=(32, 16), codec="libx264"):
+    """Make a video of plain or noisy frames, four a second, with its index in front."""
+    draw = np.random.default_rng(0)
+    with av.open(path, "w", options={"movflags": "faststart"}) as video:
+        options = {"qscale": "1"} if codec == "mjpeg" else {"g": "5", "bf": "0"}
+        stream = video.add_stream(codec, rate=4, options=options)
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        for number in range(frames):
+            shown = np.full((*size[::-1], 3), 10 * number, np.uint8)
+            shown[: size[1] // 2] = 255
+            noise = draw.integers(256, size=shown.shape, dtype=np.uint8)
+            video.mux(
+                stream.encode(av.VideoFrame.from_ndarray(noise if codec == "mjpeg" else shown))
+            )
+        video.mux(stream.encode())
+    return path
+
+
 def test_pictures_come_back_as_they_were(demos, tmp_path):
     save_pictures(demos, tmp_path / "shown")
     back = load_pictures(tmp_path / "shown", vocabulary=VOCABULARY)
     assert_same(back, demos)
     assert torch.equal(back.tokens, demos.tokens)
-
-
-def test_each_picture_of_a_gif_is_a_frame(tmp_path):
-    first, *others = (Image.new("RGB", (24, 16), colour) for colour in ("red", "blue", "green"))
-    first.save(
-        tmp_path / "a.gif", save_all=True, append_images=others, duration=[500, 40, 0], comment="by"
-    )
-    list_of(tmp_path, ["a"])
-    assert load_pictures(tmp_path, close=False).lengths.tolist() == [3]
-
-
-def test_animations_that_are_cut_short_are_refused(tmp_path):
-    noise = np.random.default_rng(0).integers(256, size=(2, 3, 3, 3), dtype=np.uint8)
-    first, *others = map(Image.fromarray, noise)
-    # A transparent colour with the number of the trailer byte: a cut right after it must not pass.
-    first.save(
-        tmp_path / "a.gif",
-        save_all=True,
-        append_images=others,
-        duration=590,
-        transparency=59,
-        disposal=2,
-    )
-    list_of(tmp_path, ["a"])
-    path = tmp_path / "a.gif"
-    content = path.read_bytes()
-    assert load_pictures(tmp_path, close=False).lengths.tolist() == [2]
-    for length in range(len(content)):
-        path.write_bytes(content[:length])
-        with pytest.raises(UserError, match=r"^episode 'a': .*a\.gif.* cannot be read"):
-            load_pictures(tmp_path)
 
 
 def test_videos_show_every_frame_at_twice_the_size(demos, tmp_path):
@@ -76,55 +85,76 @@ def test_pictures_come_back_with_as_many_channels(channels, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "channels", "allowed"),
-    [("png", 2, "1, 3 or 4"), ("mp4", 2, "1 or 3"), ("mp4", 4, "1 or 3")],
+    ("kind", "shape", "said"),
+    [
+        ("png", (2, 16, 24), "number of channels 2: choose one of 1, 3, 4"),
+        ("mp4", (4, 16, 24), "number of channels 4: choose one of 1, 3"),
+        ("mp4", (3, 15, 24), "even numbers of pixels, these images have 24x15: give scale=2"),
+    ],
 )
-def test_frames_that_are_no_pictures_are_refused(kind, channels, allowed, tmp_path):
-    frames = torch.zeros(4, channels, 16, 24, dtype=torch.uint8)
-    with pytest.raises(UserError, match=f"{allowed} colours, these frames have {channels}"):
-        save_pictures(Demonstrations.from_arrays([frames], ["go"]), tmp_path / "shown", kind=kind)
+def test_frames_that_cannot_be_written_are_refused(kind, shape, said, tmp_path):
+    demos = Demonstrations.from_arrays([torch.zeros(4, *shape, dtype=torch.uint8)], ["go"])
+    with pytest.raises(UserError, match=said):
+        save_pictures(demos, tmp_path / "shown", kind=kind)
     assert not list(tmp_path.iterdir())
 
 
-def test_videos_with_odd_sides_are_refused(tmp_path):
-    demos = Demonstrations.from_arrays([torch.zeros(4, 3, 15, 24, dtype=torch.uint8)], ["go"])
-    with pytest.raises(UserError, match="even numbers of pixels, these images have 24x15: give sc"):
-        save_pictures(demos, tmp_path / "shown", kind="mp4")
-    assert not list(tmp_path.iterdir())
-    save_pictures(demos, tmp_path / "shown", kind="mp4", scale=2)
-    assert load_pictures(tmp_path / "shown").image_shape == (3, 30, 48)
+def test_what_has_no_instruction_is_not_written(tmp_path):
+    frames = [torch.zeros(2, 3, 8, 8, dtype=torch.uint8)] * 2
+    tokens = torch.tensor([[1], [0]])
+    demos = Demonstrations.from_arrays(frames, tokens, vocabulary=Vocabulary(["up"], length=1))
+    with pytest.raises(UserError, match="demonstration 1 has no instruction"):
+        save_pictures(demos, tmp_path / "pictures")
 
 
-def test_videos_that_are_cut_short_are_refused(demos, tmp_path):
-    save_pictures(demos[:1], tmp_path / "shown", kind="mp4")
-    path = tmp_path / "shown" / "0.mp4"
+def test_what_is_there_is_not_replaced(demos, tmp_path):
+    save_pictures(demos[:1], tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    for folder in (tmp_path, tmp_path / "episodes.jsonl"):
+        with pytest.raises(UserError, match="exists and is no empty folder: name another one"):
+            save_pictures(demos, folder)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_animations_show_each_frame_or_are_refused_where_they_are_cut_short(tmp_path):
+    noise = np.random.default_rng(0).integers(256, size=(2, 3, 3, 3), dtype=np.uint8)
+    first, *others = map(Image.fromarray, noise)
+    # A transparent colour with the number of the trailer byte: a cut right after it must not pass.
+    saving = {"save_all": True, "append_images": others, "transparency": 59, "disposal": 2}
+    first.save(tmp_path / "a.gif", duration=[590, 0], **saving)
+    list_of(tmp_path, "a")
+    path = tmp_path / "a.gif"
     content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(UserError, match=r"^episode '0': .*0\.mp4 cannot be read"):
-        load_pictures(tmp_path / "shown")
-    with av.open(path, "w", options={"movflags": "faststart"}) as video:
-        stream = video.add_stream("mjpeg", rate=4, options={"qscale": "1"})
-        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuvj420p"
-        for _ in range(9):
-            noise = np.random.default_rng(0).integers(256, size=(64, 64, 3), dtype=np.uint8)
-            video.mux(stream.encode(av.VideoFrame.from_ndarray(noise)))
-        video.mux(stream.encode())
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [2]
+    for length in range(len(content)):
+        path.write_bytes(content[:length])
+        with pytest.raises(UserError, match=r"^episode 'a': .*a\.gif.* cannot be read"):
+            load_pictures(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "codec"),
+    [("mkv", "libx264"), ("avi", "mpeg4"), ("mov", "libx264"), ("mp4", "mjpeg")],
+)
+def test_videos_are_whole_or_refused(suffix, codec, tmp_path):
+    path = make_video(tmp_path / f"a.{suffix}", size=(64, 64), codec=codec)
+    list_of(tmp_path, "a")
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [20]
     content = path.read_bytes()
-    path.write_bytes(content[:-300])  # a part of the last frame
-    with pytest.raises(UserError, match=r"cut short: it ends at 2\.00 s"):
-        load_pictures(tmp_path / "shown")
     path.write_bytes(content[: len(content) * 2 // 3])
-    with pytest.raises(
-        UserError, match=r"^episode '0': .* is cut short: it ends at 1.00 s and says 2\.25 s"
-    ):
-        load_pictures(tmp_path / "shown")
+    with pytest.raises(UserError, match=r"^episode 'a': .* (is cut short|cannot be read)"):
+        load_pictures(tmp_path)
+    if codec == "mjpeg":  # of frames that are as long as the cut
+        path.write_bytes(content[:-300])
+        with pytest.raises(UserError, match=r"cut short: it ends at 4\.75 s and says 5\.00 s"):
+            load_pictures(tmp_path)
 
 
-def test_any_path_and_colour_mode_will_do(tmp_path):
+def test_any_path_colour_mode_and_line_break_will_do(tmp_path):
     picture(tmp_path / "one" / "0.png", 7, mode="L")
-    picture(tmp_path / "one" / "1.png", 8, mode="RGBA")
-    lines = [{"episode": "first", "instruction": "Go on", "frames": "one"}]
-    (tmp_path / "episodes.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n\n")
+    picture(tmp_path / "one" / "1.PNG", 8, mode="RGBA")
+    line = '{"episode": "first", "instruction": "Go\u2028on", "frames": "one"}\r\n\n'
+    (tmp_path / "episodes.jsonl").write_bytes(line.encode("utf-8-sig"))
     demos = load_pictures(tmp_path, close=False)
     assert demos.image_shape == (3, 16, 24)
     assert all_frames(demos).amax((1, 2, 3)).tolist() == [7, 8]
@@ -144,7 +174,7 @@ def test_frames_are_in_the_order_of_their_numbers(names, tmp_path):
     values = {name: 9 * value for value, name in enumerate(names)}
     for name in random.Random(0).sample(names, len(names)):
         picture(tmp_path / "a" / name, values[name])
-    list_of(tmp_path, ["a"])
+    list_of(tmp_path, "a")
     demos = load_pictures(tmp_path, close=False)
     assert all_frames(demos)[:, 0, 0, 0].tolist() == list(values.values())
 
@@ -152,148 +182,59 @@ def test_frames_are_in_the_order_of_their_numbers(names, tmp_path):
 @pytest.mark.parametrize(
     ("names", "said"),
     [
-        (["0000", "0001", "0003", "0005"], r"0002\.png is missing between 0001\.png and 0003\.png"),
-        (["cam-8", "cam-9", "cam-11"], r"cam-10\.png is missing between cam-9\.png and cam-11"),
-        (["0", "5", "10", "20"], r"15\.png is missing between 10\.png and 20\.png"),
-        (["0", "1", "01", "3"], r"01\.png and 1\.png have the same number"),
+        ("0000 0001 0003 0005", r"0002\.png is missing between 0001\.png and 0003\.png"),
+        ("cam-8 cam-9 cam-11", r"cam-10\.png is missing between cam-9\.png and cam-11"),
+        ("0 5 10 20", r"15\.png is missing between 10\.png and 20\.png"),
+        ("0 1 01 3", r"01\.png and 1\.png have the same number"),
     ],
 )
 def test_missing_frames_are_named(names, said, tmp_path):
-    for name in names:
+    for name in names.split():
         picture(tmp_path / "a" / f"{name}.png", 7)
-    list_of(tmp_path, ["a"])
+    list_of(tmp_path, "a")
     with pytest.raises(UserError, match=f"^episode 'a': {said}"):
         load_pictures(tmp_path)
 
 
-def list_of(folder, names):
-    lines = [json.dumps({"episode": name, "instruction": "go"}) for name in names]
-    (folder / "episodes.jsonl").write_text("\n".join(lines))
+def png(array):
+    file = BytesIO()
+    Image.fromarray(array).save(file, "PNG")
+    return file.getvalue()
 
 
-def test_the_list_may_have_a_mark_and_any_line_break_in_a_sentence(tmp_path):
-    write(tmp_path, [("a", "go", [0, 1])])
-    line = '{"episode": "a", "instruction": "go\u2028on"}\r\n'
-    (tmp_path / "episodes.jsonl").write_bytes(line.encode("utf-8-sig"))
-    assert load_pictures(tmp_path).sentences() == ["go on"]
-
-
-def picture(path, value, size=(24, 16), mode="RGB"):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.full((size[1], size[0], 3), value, np.uint8)).convert(mode).save(path)
-
-
-def write(folder, episodes):
-    lines = []
-    for name, instruction, values in episodes:
-        for step, value in enumerate(values):
-            picture(folder / name / f"{step}.png", value)
-        lines.append(json.dumps({"episode": name, "instruction": instruction}))
-    (folder / "episodes.jsonl").write_text("\n".join(lines))
-
-
-def damage(folder, how):
-    write(folder, [("a", "go", [0, 1]), ("b", "stop", [2, 3])])
-    how(folder)
-
-
-def small(folder):
-    picture(folder / "b" / "1.png", 3, size=(8, 8))
-
-
-def cut(folder):
-    path = folder / "b" / "1.png"
-    noise = np.random.default_rng(0).integers(256, size=(16, 24, 3), dtype=np.uint8)
-    Image.fromarray(noise).save(path)
-    path.write_bytes(path.read_bytes()[:700])
-
-
-def keep(folder, suffix):
-    """Leave files of one kind as the frames."""
-    for path in (folder / "b").iterdir():
-        path.rename(path.with_suffix(suffix))
-
-
-def beside(folder, *names):
-    shutil.rmtree(folder / "b")
-    for name in names:
-        (folder / name).touch()
-
-
-def pipe(folder):
-    (folder / "b" / "1.png").unlink()
-    os.mkfifo(folder / "b" / "1.png")
-
-
-def deep(folder):
-    Image.fromarray(np.full((16, 24), 1000, np.uint16)).save(folder / "b" / "1.png")
+NOISE = np.random.default_rng(0).integers(256, size=(16, 24, 3), dtype=np.uint8)
 
 
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("name", "content", "said"),
     [
-        (
-            lambda f: (f / "episodes.jsonl").unlink(),
-            "jsonl does not exist: write one",
-        ),
-        (lambda f: (f / "episodes.jsonl").write_text("\n"), "lists no episode"),
-        (lambda f: (f / "episodes.jsonl").write_text('["a"]'), "line 1: a line is a JSON object"),
-        (lambda f: write(f, [("a", "go", [0]), ("b", None, [0])]), "'b' has no .*found None"),
-        (
-            lambda f: (f / "episodes.jsonl").write_bytes("{é}".encode("latin-1")),
-            r"episodes\.jsonl cannot be read .*: save it as UTF-8",
-        ),
-        (lambda f: write(f, [("a", "go", [0, 1])] * 2), "lists episode 'a' 2 times"),
-        (lambda f: write(f, [("a", "go", [0, 1]), ("c", "go", [])]), "episode 'c' has no frames"),
-        (lambda f: keep(f, ".npy"), "episode 'b' has no frames: .* but .npy"),
-        (lambda f: beside(f, "b.npy"), "episode 'b': .*b.npy is of a kind that is not read: give"),
-        (lambda f: beside(f, "b.webp", "b.gif"), "episode 'b': .*b.gif cannot be read"),
-        (pipe, r"episode 'b': .*1\.png cannot be read .*no regular file"),
-        (small, "episode 'b': 1.png has 8x8 pixels, the first frame has 24x16"),
-        (cut, r"episode 'b': 1\.png cannot be read \(image file is truncated"),
-        (deep, "episode 'b': 1.png has numbers of mode 'I;16': save it with 8 bits"),
-        (
-            lambda f: (f / "b" / "1.png").write_bytes(b"no picture"),
-            "episode 'b': .* cannot be read",
-        ),
+        ("episodes.jsonl", None, "jsonl does not exist: write one"),
+        ("episodes.jsonl", b"\n", "lists no episode"),
+        ("episodes.jsonl", b'["a"]', "line 1: a line is a JSON object"),
+        ("episodes.jsonl", b"[" * 100_000, "line 1: a line is a JSON object"),
+        ("episodes.jsonl", "{é}".encode("latin-1"), r"jsonl cannot be read .*: save it as UTF-8"),
+        ("episodes.jsonl", line("a") + b"\n" + line("a"), "lists episode 'a' twice"),
+        ("episodes.jsonl", line("c"), "episode 'c': it has no frames: neither .*c nor"),
+        ("episodes.jsonl", line("a", None), "'a' has no instruction .*found None"),
+        ("episodes.jsonl", line("a", frames="."), "'a': .* holds none of .png.* but .jsonl"),
+        ("episodes.jsonl", line("a", frames="episodes.jsonl"), "is of a kind that is not read: gi"),
+        ("a/1.png", os.mkfifo, r"episode 'a': 1\.png cannot be read .*no regular file"),
+        ("a/1.png", png(NOISE[:8, :8]), r"'a': 1\.png has 8x8 pixels, the first frame has 24x16"),
+        ("a/1.png", png(NOISE)[:700], r"'a': 1\.png cannot be read \(image file is truncated"),
+        ("a/1.png", png(NOISE[..., 0].astype(np.uint16)), r"1\.png .* mode 'I;16': save 8 bits"),
+        ("a/1.png", b"no picture", r"episode 'a': 1\.png cannot be read"),
     ],
 )
-def test_what_is_wrong_is_said_with_the_name_of_the_episode(how, said, tmp_path):
-    damage(tmp_path, how)
-    with pytest.raises(UserError, match=said):
+def test_what_is_wrong_is_said_with_the_name_of_the_episode(name, content, said, tmp_path):
+    write(tmp_path, "a")
+    (tmp_path / name).unlink()
+    if callable(content):
+        content(tmp_path / name)
+    elif content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=said) as error:
         load_pictures(tmp_path)
-
-
-def test_what_is_there_is_not_replaced(demos, tmp_path):
-    save_pictures(demos[:1], tmp_path)
-    before = sorted(tmp_path.rglob("*"))
-    for folder in (tmp_path, tmp_path / "episodes.jsonl"):
-        with pytest.raises(UserError, match="exists and is no empty folder: name another one"):
-            save_pictures(demos, folder)
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-def make_video(path, frames=20, size=(32, 16), codec="libx264"):
-    """Make a video of plain frames, four a second."""
-    with av.open(path, "w") as video:
-        stream = video.add_stream(codec, rate=4, options={"g": "5", "bf": "0"})
-        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        for number in range(frames):
-            shown = np.full((*size[::-1], 3), 10 * number, np.uint8)
-            shown[: size[1] // 2] = 255
-            video.mux(stream.encode(av.VideoFrame.from_ndarray(shown)))
-        video.mux(stream.encode())
-    return path
-
-
-@pytest.mark.parametrize("suffix", ["mkv", "avi", "mov"])
-def test_videos_of_other_kinds_are_whole_or_refused(suffix, tmp_path):
-    path = make_video(tmp_path / f"a.{suffix}", codec="mpeg4" if suffix == "avi" else "libx264")
-    assert len(list(read_video(path))) == 20
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) * 2 // 3])
-    with pytest.raises(UserError, match=r"cut short|cannot be read"):
-        list(read_video(path))
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -310,9 +251,9 @@ def test_a_list_of_other_files_is_no_video(content, tmp_path):
 
 
 def test_a_recording_that_was_cut_stays_open(tmp_path):
-    write(tmp_path, [("a", "go", [0, 1]), ("b", "go", [0, 1])])
-    lines = (tmp_path / "episodes.jsonl").read_text().replace("}", ', "truncated": true}', 1)
-    (tmp_path / "episodes.jsonl").write_text(lines)
+    write(tmp_path, "a", "b")
+    listed = line("a", truncated=True) + b"\n" + line("b", truncated=False)
+    (tmp_path / "episodes.jsonl").write_bytes(listed)
     assert load_pictures(tmp_path).lengths.tolist() == [2, 3]
     assert load_pictures(tmp_path, close=False).lengths.tolist() == [2, 2]
 
@@ -335,15 +276,11 @@ def test_a_video_may_hold_frames_that_are_not_shown(tmp_path):
 
 
 def test_pictures_and_videos_come_the_right_way_up(tmp_path):
-    path = make_video(tmp_path / "a.mp4", frames=3)
+    path = make_video(tmp_path / "a.mp4", frames=2)
     content = bytearray(path.read_bytes())
     at = content.index(b"tkhd") + 44  # the matrix by which a player turns the frames
     content[at : at + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 16 << 16, 0, 1 << 30)
     path.write_bytes(content)
-    turned = np.asarray(next(iter(read_video(path))))
-    assert turned.shape == (32, 16, 3)
-    assert turned[:, 8:].min() > 200 and turned[:, :8].max() < 50  # what was above is on the right
-
     (tmp_path / "b").mkdir()
     for number in range(2):
         shown = Image.new("RGB", (32, 16))
@@ -351,9 +288,10 @@ def test_pictures_and_videos_come_the_right_way_up(tmp_path):
         exif = shown.getexif()
         exif[0x0112] = 6  # a phone held upright
         shown.save(tmp_path / "b" / f"{number}.jpg", exif=exif)
-    list_of(tmp_path, ["b"])
-    frames = load_pictures(tmp_path)[0]["pixels"]
-    assert frames.shape[1:] == (3, 32, 16)
+    list_of(tmp_path, "a", "b")
+    frames = all_frames(load_pictures(tmp_path, close=False))
+    assert frames.shape == (4, 3, 32, 16)
+    # What was above is on the right.
     assert frames[..., 8:].min() > 200 and frames[..., :8].max() < 50
 
 
@@ -363,17 +301,9 @@ def test_a_photo_may_hold_a_preview_and_an_animation_is_no_frame(tmp_path):
         shown, preview = Image.new("RGB", (16, 16), (number, 0, 0)), Image.new("RGB", (4, 4))
         path = tmp_path / "a" / f"{number}.jpg"
         shown.save(path, format="MPO", save_all=True, append_images=[preview])
-    list_of(tmp_path, ["a"])
+    list_of(tmp_path, "a")
     assert load_pictures(tmp_path, close=False).lengths.tolist() == [3]
     shown = [Image.new("RGB", (16, 16), colour) for colour in ("red", "blue")]
     shown[0].save(tmp_path / "a" / "3.webp", save_all=True, append_images=shown[1:])
-    with pytest.raises(UserError, match=r"episode 'a': 3\.webp holds 2 pictures"):
+    with pytest.raises(UserError, match=r"episode 'a': 3\.webp .* \(it holds 2 pictures"):
         load_pictures(tmp_path)
-
-
-def test_what_has_no_instruction_is_not_written(tmp_path):
-    frames = [torch.zeros(2, 3, 8, 8, dtype=torch.uint8)] * 2
-    tokens = torch.tensor([[1], [0]])
-    demos = Demonstrations.from_arrays(frames, tokens, vocabulary=Vocabulary(["up"], length=1))
-    with pytest.raises(UserError, match="demonstration 1 has no instruction"):
-        save_pictures(demos, tmp_path / "pictures")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Iterable, Iterator
 from io import BytesIO
@@ -10,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, ImageSequence
 
-from ifo_grounding.data._episodes import Name
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import regular_file
 
@@ -31,63 +31,69 @@ BROKEN = (
 )
 """What Pillow raises for files that are damaged, cut short, or no files."""
 
+Source = Image.Image | Path | bytes
+"""An image, its file, or what is in the file."""
+
 
 def open_image(source: Path | bytes) -> Image.Image:
-    """Open an image, a regular file or its content.
-
-    Raises:
-        OSError: (or another of :data:`BROKEN`) where it is no image of :data:`FORMATS`.
-    """
+    """Open a single image (of a photo, which may hold a preview too, the first) or raise BROKEN."""
     given = regular_file(source) if isinstance(source, Path) else BytesIO(source)
-    return Image.open(given, formats=FORMATS)
+    image = Image.open(given, formats=FORMATS)
+    if image.format != "MPO" and (count := getattr(image, "n_frames", 1)) > 1:
+        raise OSError(f"it holds {count} pictures: save them one by one")
+    return image
 
 
-def stack_images(
-    name: Name, images: Iterable[tuple[str, Image.Image]], channels: int = 3
-) -> np.ndarray:
-    """Return the images of an episode, each with its own name, as frames [T + 1, C, H, W].
+def stack_images(images: Iterable[tuple[str, Source]], channels: int = 3) -> np.ndarray:
+    """Return the images of an episode, each with its name, as frames [T + 1, C, H, W].
 
     C is the number of ``channels``: 1 for grey, 3 for colours, 4 with alpha.
 
     Raises:
-        UserError: naming the episode and the image, where there is none, or one is of another size
-            or not made of bytes.
+        UserError: naming the image that cannot be read, is of another size or not made of bytes;
+            or where there is none.
     """
     frames: list[np.ndarray] = []
-    for place, image in images:
-        if image.mode in NOT_BYTES:
-            raise UserError(
-                f"episode {name!r}: {place} has numbers of mode {image.mode!r}: save it with 8 "
-                "bits per colour"
-            )
+    for name, source in images:
         try:
-            if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
-                image = ImageOps.exif_transpose(image)  # as it is shown
-            shown = np.asarray(image.convert(MODES[channels]))
+            shown = _pixels(source, MODES[channels])
         except BROKEN as error:
-            raise UserError(f"episode {name!r}: {place} cannot be read ({error})") from None
+            raise UserError(f"{name} cannot be read ({error})") from None
         frames.append(shown.reshape(*shown.shape[:2], channels))
         if frames[-1].shape != frames[0].shape:
             found, first = (f"{one.shape[1]}x{one.shape[0]}" for one in (frames[-1], frames[0]))
             raise UserError(
-                f"episode {name!r}: {place} has {found} pixels, the first frame has {first}: scale "
-                "them to one size"
+                f"{name} has {found} pixels, the first frame has {first}: scale them to one size"
             )
     if not frames:
-        raise UserError(f"episode {name!r} has no frames")
+        raise UserError("it has no frames")
     return np.stack(frames).transpose(0, 3, 1, 2)
 
 
-def animation_frames(path: Path) -> Iterator[tuple[int, Image.Image]]:
-    """Yield number and image of each frame of an animation, however long it is shown.
+def _pixels(source: object, mode: str) -> np.ndarray:
+    """Return an image as it is shown, uint8 [H, W] or [H, W, C]."""
+    if not isinstance(source, Source):
+        raise TypeError(f"{source!r:.40} is no picture")
+    opened = (
+        contextlib.nullcontext(source) if isinstance(source, Image.Image) else open_image(source)
+    )
+    with opened as image:
+        if image.mode in NOT_BYTES:
+            raise ValueError(f"it has numbers of mode {image.mode!r}: save 8 bits per colour")
+        if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
+            image = ImageOps.exif_transpose(image)
+        return np.asarray(image.convert(mode))
 
-    Raises:
-        OSError: (or another of :data:`BROKEN`) where it is damaged or cut short.
-    """
-    content = regular_file(path).read_bytes()
-    file = BytesIO(content + b"\0")
-    with Image.open(file, formats=FORMATS) as opened:
-        yield from enumerate(ImageSequence.Iterator(opened))
-        # Pillow takes what there is of a GIF: without its last byte, it has read on to ours.
-        if opened.format == "GIF" and file.tell() > len(content):
-            raise OSError("it is cut short")
+
+def animation_frames(path: Path) -> Iterator[Image.Image]:
+    """Yield each frame of an animation, however long it is shown; refuse one that is cut short."""
+    try:
+        content = regular_file(path).read_bytes()
+        file = BytesIO(content + b"\0")
+        with Image.open(file, formats=FORMATS) as opened:
+            yield from ImageSequence.Iterator(opened)
+            # Pillow takes what there is of a GIF: without its last byte, it has read on to ours.
+            if opened.format == "GIF" and file.tell() > len(content):
+                raise OSError("it is cut short")
+    except BROKEN as error:
+        raise UserError(f"{path} cannot be read ({error})") from None

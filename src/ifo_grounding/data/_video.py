@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from ifo_grounding.errors import UserError, extra
+from ifo_grounding.errors import UserError, optional
 from ifo_grounding.files import regular_file
 
 CODEC = "libx264"
@@ -19,12 +18,8 @@ OPTIONS = {"format_whitelist": "mov,matroska,avi", "protocol_whitelist": "file"}
 
 
 def read_video(path: Path) -> Iterator[Image.Image]:
-    """Yield the frames of a video as a player shows them, the right way up.
-
-    Raises:
-        UserError: where it is no regular file or cannot be read, or ends before it says.
-    """
-    _, av = _libraries()
+    """Yield the frames of a video as a player shows them; refuse one that ends before it says."""
+    av = optional("av", extra="video")
     whole, end = 0, 0.0
     try:
         with av.open(f"file:{regular_file(path)}", options=OPTIONS) as video:
@@ -60,24 +55,18 @@ def _seconds(video: Any, stream: Any) -> float:
     return video.duration / 1e6 if alone else 0.0
 
 
-def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
-    """Write frames, uint8 [T + 1, H, W, 3], as a video that browsers and players show.
-
-    Raises:
-        UserError: where a side has an odd number of pixels, which this kind of video cannot have.
-    """
-    iio, _ = _libraries()
+def write_video(path: Path, frames: np.ndarray, fps: int) -> None:
+    """Write frames, uint8 [T + 1, H, W, 3], as a video that browsers and players show."""
+    av = optional("av", extra="video")
     height, width = frames.shape[1:3]
     if height % 2 or width % 2:
         raise UserError(
             f"a video needs even numbers of pixels, these images have {width}x{height}: give "
             "scale=2, or kind='png'"
         )
-    iio.imwrite(path, frames, plugin="pyav", codec=CODEC, fps=fps)
-
-
-def _libraries() -> tuple[ModuleType, ModuleType]:
-    with extra("video", "videos need imageio and PyAV"):
-        import av
-        import imageio.v3 as iio
-    return iio, av
+    with av.open(path, "w") as video:
+        stream = video.add_stream(CODEC, rate=fps)
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for frame in frames:
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+        video.mux(stream.encode())

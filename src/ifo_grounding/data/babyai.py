@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, redirect_stdout
+from contextlib import redirect_stdout
 from io import StringIO
 from multiprocessing import get_context
-from typing import Any, Literal, overload
+from typing import Any, Literal, cast, overload
 
 import gymnasium
 import numpy as np
@@ -17,11 +17,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ifo_grounding.data._episodes import Episode
 from ifo_grounding.data.codec import TILE_SIZES
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.wrapping import world_seed
-from ifo_grounding.errors import UserError, at_least_one, check_choice, extra
+from ifo_grounding.errors import UserError, at_least_one, check_choice, optional
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -56,31 +57,23 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
     """
     check_choice("mission", mission, MISSIONS)
     name = level if level.endswith(("-v0", "-v1")) else f"BabyAI-{level}-v0"
-    with extra("babyai", "BabyAI needs minigrid"):
-        import minigrid  # noqa: F401  (registers the levels)
+    optional("minigrid", extra="babyai")  # registers the levels
     if name not in gymnasium.registry:
         known = sorted(i[7:-3] for i in gymnasium.registry if i.startswith("BabyAI-"))
         raise UserError(f"there is no level {name!r}: choose among {', '.join(known)}")
-    return functools.partial(_make, name, tile_size, mission)
-
-
-def _make(name: str, tile_size: int, mission: str) -> gymnasium.Env:
-    import minigrid  # noqa: F401
-
-    # The observation is another than the one declared, which the checker would refuse.
-    return _Room(gymnasium.make(name, disable_env_checker=True), tile_size, mission)
+    return functools.partial(_Room, name, tile_size, mission)
 
 
 class _Room(gymnasium.Wrapper):
     """Shows a level's whole room, and keeps it from printing whenever it draws a room anew."""
 
-    def __init__(self, env: gymnasium.Env, tile_size: int, mission: str) -> None:
-        super().__init__(env)
+    def __init__(self, name: str, tile_size: int, mission: str) -> None:
+        # The observation is another than the one declared, which the checker would refuse.
+        super().__init__(gymnasium.make(f"minigrid:{name}", disable_env_checker=True))
         self.tile_size, self.mission, self._earned = tile_size, mission, 0.0
-        level: Any = env.unwrapped
+        self.level = level = cast(Any, self.unwrapped)
         # In place of what the agent sees, whose computation takes longer than all else.
         level.gen_obs = self._look
-        self.level = level
         size = (level.height * tile_size, level.width * tile_size, 3)
         image = gymnasium.spaces.Box(0, 255, size, np.uint8)
         words = level.observation_space["mission"]
@@ -102,10 +95,7 @@ class _Room(gymnasium.Wrapper):
         return seen, self._earned if pays else 0.0, False, truncated, info
 
     def _look(self) -> dict[str, Any]:
-        return {"image": self._picture(), "mission": self.level.mission}
-
-    def _picture(self) -> np.ndarray:
-        """Draw the room and what is carried, uint8 [H, W, 3]."""
+        """Draw the room and what is carried, uint8 [H, W, 3], beside the mission."""
         grid, size = self.level.grid, self.tile_size
         draw = functools.partial(grid.render_tile, tile_size=size)  # keeps what it has drawn
         tiles = [draw(cell) for cell in grid.grid]
@@ -115,7 +105,8 @@ class _Room(gymnasium.Wrapper):
         if self.level.carrying is not None:
             tiles[0] = draw(self.level.carrying)
         cells = np.stack(tiles).astype(np.uint8).reshape(grid.height, grid.width, size, size, 3)
-        return cells.swapaxes(1, 2).reshape(grid.height * size, grid.width * size, 3)
+        image = cells.swapaxes(1, 2).reshape(grid.height * size, grid.width * size, 3)
+        return {"image": image, "mission": self.level.mission}
 
 
 Played = tuple[np.ndarray, str, list[int]]
@@ -146,14 +137,13 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
     """Record BabyAI's bot: frames and missions, never actions.
 
     The bot's own end is followed by one repeated frame, the stop. Episodes that it does not solve
-    are left out.
+    are left out. The rooms are none of those that :func:`~ifo_grounding.envs.from_gymnasium` shows.
 
     Args:
         level: of BabyAI, see :func:`babyai`.
         n: number of demonstrations.
         keep_truth: whether to return the bot's actions too, for evaluation only.
-        seed: of the stream of rooms, which are other ones than those of
-            :func:`~ifo_grounding.envs.from_gymnasium`.
+        seed: of the stream of rooms.
         stream: name of the stream.
         tile_size: pixels along one side of a cell.
         processes: how many record side by side; with several, a script needs its
@@ -162,34 +152,30 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
         progress: whether to show a bar.
 
     Returns:
-        Demonstrations of ``n`` episodes, closed; with ``keep_truth`` also a
+        The demonstrations, closed; with ``keep_truth`` also a
         :class:`~ifo_grounding.data.truth.Truth`.
 
     Raises:
         UserError: where minigrid is missing, there is no such level, or the bot fails too often.
     """
     n, processes = at_least_one("n", n), at_least_one("processes", processes)
-    play = functools.partial(_play, babyai(level, tile_size))
     name = f"{level.removeprefix('BabyAI-').removesuffix('-v0')} {stream}"
     seeds = (derive(seed, "babyai", name, number) % 2**31 for number in range(PATIENCE * n))
+    make = babyai(level, tile_size)
     actions: list[int] = []
 
-    def episodes() -> Iterator[tuple[int, np.ndarray, str]]:
-        solved = 0
-        bar = tqdm(total=n, desc=f"record {level}", disable=not progress)
-        with bar, _mapper(processes) as run:
-            for played in filter(None, run(play, seeds)):
-                frames, mission, taken = played
-                yield solved, frames, mission
-                actions.extend(taken)
-                solved += 1
-                bar.update()
-                if solved == n:
-                    return
-        raise UserError(
-            f"the bot solved {solved} of {PATIENCE * n} episodes of {level}: choose a level that "
-            "it can solve"
-        )
+    def episodes() -> Iterator[Episode]:
+        solved = filter(None, _played(make, seeds, processes))
+        shown = tqdm(itertools.islice(solved, n), f"record {level}", n, disable=not progress)
+        count = 0
+        for count, (frames, mission, taken) in enumerate(shown, start=1):
+            actions.extend(taken)
+            yield count - 1, frames, mission
+        if count < n:
+            raise UserError(
+                f"the bot solved {count} of {PATIENCE * n} episodes of {level}: choose a level "
+                "that it can solve"
+            )
 
     demos = Demonstrations.from_episodes(
         episodes(),
@@ -202,13 +188,7 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
 
 
 def bot_outcomes(
-    level: str,
-    episodes: int,
-    *,
-    seed: int = 0,
-    stream: str = "evaluation",
-    processes: int = 1,
-    progress: bool = False,
+    level: str, episodes: int, *, seed: int = 0, stream: str = "evaluation", processes: int = 1
 ) -> Tensor:
     """Return whether BabyAI's bot fulfils its mission in each of the rooms of a stream, bool [N].
 
@@ -221,7 +201,6 @@ def bot_outcomes(
         seed: of the stream.
         stream: ``training``, ``validation`` or ``evaluation``.
         processes: how many play side by side.
-        progress: whether to show a bar.
 
     Raises:
         UserError: where minigrid is missing, there is no such level or stream, or nothing to play.
@@ -229,33 +208,19 @@ def bot_outcomes(
     check_choice("stream", stream, STREAMS)
     episodes, processes = at_least_one("episodes", episodes), at_least_one("processes", processes)
     seeds = (world_seed(seed, stream, number) for number in range(episodes))
-    play = functools.partial(_play, babyai(level))
-    bar = tqdm(total=episodes, desc=f"bot in {level}", disable=not progress)
-    solved = []
-    with bar, _mapper(processes) as run:
-        for played in run(play, seeds):
-            solved.append(played is not None)
-            bar.update()
-    return torch.tensor(solved)
+    return torch.tensor([one is not None for one in _played(babyai(level), seeds, processes)])
 
 
-@contextmanager
-def _mapper(processes: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """Give ``map`` over this process or several, in order and no further ahead than needed."""
+def _played(make: Make, seeds: Iterator[int], processes: int) -> Iterator[Played | None]:
+    """Yield what the bot did in the room of each seed, in order, played no further than needed."""
+    play = functools.partial(_play, make)
     if processes == 1:
-        yield map
+        yield from map(play, seeds)
         return
     # Fresh processes: forked ones would inherit torch's threads.
-    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
-
-    def run(play: Callable[[int], Any], seeds: Iterator[int]) -> Iterator[Any]:
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         while some := list(itertools.islice(seeds, 16 * processes)):
             yield from pool.map(play, some)
-
-    try:
-        yield run
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _play(make: Make, seed: int) -> Played | None:
@@ -265,19 +230,17 @@ def _play(make: Make, seed: int) -> Played | None:
     env = make()
     observation, _ = env.reset(seed=seed)
     bot = BabyAIBot(env.unwrapped)
-    frames, actions, action = [observation["image"]], [], None
-    while True:
+    frames, actions, action, ended = [observation["image"]], [], None, False
+    while not ended:
         try:
             action = bot.replan(action)
         except Exception:  # some rooms are beyond it, and it says so in many ways
             return None
         seen, reward, terminated, truncated, _ = env.step(action)
+        ended = terminated or truncated
         frames.append(seen["image"])
         actions.append(int(action))
-        if terminated or truncated:
-            break
     if not reward:
         return None
-    frames.append(frames[-1])  # the stop
-    pictures = np.stack(frames).transpose(0, 3, 1, 2)
+    pictures = np.stack([*frames, frames[-1]]).transpose(0, 3, 1, 2)  # with the stop
     return pictures, str(observation["mission"]), [*actions, DONE]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +12,11 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import Episode
-from ifo_grounding.data._images import BROKEN, open_image, stack_images
+from ifo_grounding.data._episodes import Episode, naming
+from ifo_grounding.data._images import stack_images
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import rgb, written_sentences
-from ifo_grounding.errors import UserError, extra
+from ifo_grounding.errors import UserError, optional
 
 if TYPE_CHECKING:
     import datasets
@@ -72,14 +71,10 @@ def _selected(dataset: Any, frames: str, instruction: str) -> Iterable[Mapping[s
         raise UserError(f"choose one of the splits: dataset[...] with {splits}")
     if not hasattr(dataset, "select_columns"):
         return dataset
-    columns = dataset.column_names  # None where a stream does not know them yet
-    for name, option in ((frames, "frames"), (instruction, "instruction")):
-        if columns is not None and name not in columns:
-            raise UserError(
-                f"the dataset has no column {name!r}, but {', '.join(columns)}: name it with "
-                f"{option}=..."
-            )
-    selected = dataset.select_columns([frames, instruction])
+    try:
+        selected = dataset.select_columns([frames, instruction])
+    except ValueError as error:
+        raise UserError(f"{error}: name them with frames=... and instruction=...") from None
     feature: Any = (dataset.features or {}).get(frames)
     while hasattr(feature, "feature"):  # lists of lists
         feature = feature.feature
@@ -114,32 +109,21 @@ def _episodes(
                 f"episode {number} is a single picture, but a row is one episode: group the rows "
                 "of an episode, so that its frames are a list of pictures"
             )
-        if isinstance(shown, Sequence) and any(map(_is_picture, shown)):
-            shown = stack_images(number, _images(number, shown))
+        # None stands where a picture is missing.
+        if isinstance(shown, Sequence) and any(
+            isinstance(one, Image.Image | Mapping | None) for one in shown
+        ):
+            with naming(number):
+                shown = stack_images(map(_source, itertools.count(), shown))
         yield number, shown, row[instruction]
 
 
-def _is_picture(one: Any) -> bool:
-    """Whether a frame is a picture, or stands where one is missing."""
-    return one is None or isinstance(one, Image.Image | Mapping)
-
-
-def _images(number: int, shown: Iterable[Any]) -> Iterator[tuple[str, Image.Image]]:
-    for step, picture in enumerate(shown):
-        if isinstance(picture, Mapping):
-            content: Any = picture.get("bytes")
-            path: Any = picture.get("path")
-            if content is None and path is None:
-                raise UserError(f"episode {number}: frame {step} has neither bytes nor a path")
-            try:
-                picture = open_image(Path(path) if content is None else content)
-            except BROKEN as error:
-                raise UserError(
-                    f"episode {number}: frame {step} cannot be read ({error})"
-                ) from None
-        if not isinstance(picture, Image.Image):
-            raise UserError(f"episode {number}: frame {step} is {picture!r:.40}, not a picture")
-        yield f"frame {step}", picture
+def _source(step: int, picture: Any) -> tuple[str, Any]:
+    """Return the name of a frame and what to read it from."""
+    if isinstance(picture, Mapping):
+        content, path = picture.get("bytes"), picture.get("path")
+        picture = content if path is None or content is not None else Path(path)
+    return f"frame {step}", picture
 
 
 def to_huggingface(
@@ -147,8 +131,8 @@ def to_huggingface(
 ) -> datasets.Dataset:
     """Turn demonstrations into a dataset with the columns ``frames`` and ``instruction``.
 
-    Frames are PNG files, without loss; grey ones become RGB. The rows are written to the cache of
-    ``datasets`` a few at a time: ``save_to_disk``, ``to_parquet`` or ``push_to_hub`` carry them on.
+    Frames are PNG files, without loss; grey ones become RGB. Rows are written a few at a time:
+    ``save_to_disk``, ``to_parquet`` or ``push_to_hub`` carry them on.
 
     Args:
         demos: with a vocabulary.
@@ -158,31 +142,23 @@ def to_huggingface(
         UserError: where ``datasets`` is missing, there is no demonstration or no vocabulary, or
             frames are no pictures.
     """
-    with extra("datasets", "this needs datasets"):
-        import datasets
+    datasets = optional("datasets", extra="datasets")
     sentences = written_sentences(demos)
 
     def rows() -> Iterator[dict[str, Any]]:
         for number, sentence in enumerate(sentences):
-            shown = [{"bytes": _png(one), "path": None} for one in rgb(demos[number]["pixels"])]
-            yield {FRAMES: shown, INSTRUCTION: sentence}
+            shown = map(Image.fromarray, rgb(demos[number]["pixels"]))
+            yield {FRAMES: list(shown), INSTRUCTION: sentence}
 
+    columns = {
+        FRAMES: datasets.Sequence(datasets.Image()),
+        INSTRUCTION: datasets.Value("string"),
+    }
     return datasets.Dataset.from_generator(
         rows,
-        features=datasets.Features(
-            {
-                FRAMES: datasets.Sequence(datasets.Image()),
-                INSTRUCTION: datasets.Value("string"),
-            }
-        ),
+        features=datasets.Features(columns),
         cache_dir=None if cache_dir is None else str(cache_dir),
         # Without a name of its own, the dataset would be named by a hash of the pickled pixels.
         fingerprint=uuid.uuid4().hex,
         writer_batch_size=ROWS_IN_MEMORY,
     )
-
-
-def _png(frame: np.ndarray) -> bytes:
-    buffer = BytesIO()
-    Image.fromarray(frame).save(buffer, "PNG")
-    return buffer.getvalue()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,17 +17,16 @@ from ifo_grounding.data._episodes import Episode
 from ifo_grounding.data._images import MODES, open_image
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import rgb, written_sentences
-from ifo_grounding.errors import UserError, extra
+from ifo_grounding.errors import UserError, optional
 from ifo_grounding.files import atomic_write, regular_file
 
 if TYPE_CHECKING:
     from minari import MinariDataset
-    from minari.data_collector import EpisodeBuffer
 
 IMAGE, INSTRUCTION = "image", "mission"
 OBSERVED = "observations"
-ENDS, CUT = ("truncations", "terminations"), [True, False]
-"""Names of what says how an episode ended, and what they say of one that was cut."""
+ENDS = ("truncations", "terminations")
+"""Names of what says how an episode ended."""
 ABSENT = "actions_absent"
 DESCRIPTION = (
     "Observation-only demonstrations: actions and rewards are absent. The format demands them, so "
@@ -66,7 +64,7 @@ def from_minari(
         UserError: where Minari or the dataset is missing, the names are not those of the dataset,
             or an episode is not as it has to be, with its number.
     """
-    minari = _minari()
+    minari = optional("minari", extra="minari")
     if isinstance(dataset, str):
         try:
             dataset = minari.load_dataset(dataset)
@@ -92,7 +90,7 @@ def _episodes(
     for number in tqdm(dataset.episode_indices.tolist(), desc="read", disable=not progress):
         try:
             frames = _decoded(read(number, OBSERVED, image), shown, storage.jpeg_encoding)
-            ends = [bool(np.any(read(number, name, None))) for name in ENDS]
+            truncated, terminated = (np.any(read(number, name, None)) for name in ENDS)
             if instruction in known:
                 said = {_text(text) for text in read(number, OBSERVED, instruction)}
             else:
@@ -109,7 +107,7 @@ def _episodes(
             raise UserError(
                 f"episode {number} has {len(said)} instructions: a demonstration follows one"
             )
-        yield number, frames, said.pop(), ends == CUT
+        yield number, frames, said.pop(), bool(truncated and not terminated)
 
 
 def _text(value: Any) -> str:
@@ -170,12 +168,11 @@ def _read_group(file: Any, number: int, name: str, part: str | None) -> Any:
 def _read_table(folder: Path, kind: str, number: int, name: str, part: str | None) -> Any:
     from pyarrow import dataset
 
-    column = dataset.field(name, *([] if part is None else [part]))
-    table = dataset.dataset(
-        folder / str(number), format=kind, ignore_prefixes=["_", ".", "metadata.json"]
-    )
-    if name not in table.schema.names and name in ENDS:
+    files = folder / str(number)
+    table = dataset.dataset(files, format=kind, ignore_prefixes=["_", ".", "metadata.json"])
+    if name in ENDS and name not in table.schema.names:
         return ()
+    column = dataset.field(name) if part is None else dataset.field(name, part)
     return table.to_table(columns={"rows": column})["rows"].to_numpy()
 
 
@@ -196,7 +193,8 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
         UserError: where Minari is missing, the id is none or taken, there is no demonstration or
             no vocabulary, or frames are no pictures.
     """
-    minari = _minari()
+    minari = optional("minari", extra="minari")
+    from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.dataset.minari_storage import MinariStorage
     from minari.storage.datasets_root_dir import get_dataset_path
@@ -214,10 +212,23 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
         raise UserError(f"the dataset {dataset_id!r} exists: choose another name or version")
     _, height, width = demos.image_shape
     characters = "".join(sorted(set("".join(sentences))))
-    observations = {
+    observation = {
         IMAGE: spaces.Box(0, 255, (height, width, 3), np.uint8),
         INSTRUCTION: spaces.Text(max(map(len, sentences)), charset=characters),
     }
+
+    def buffers() -> Iterator[EpisodeBuffer]:
+        for number, sentence in enumerate(sentences):
+            frames = rgb(demos[number]["pixels"])
+            steps = len(frames) - 1
+            yield EpisodeBuffer(
+                observations={IMAGE: frames, INSTRUCTION: [sentence] * len(frames)},
+                actions=np.zeros(steps, np.int64),
+                rewards=np.zeros(steps),
+                terminations=np.arange(steps) == steps - 1,
+                truncations=np.zeros(steps, bool),
+            )
+
     try:
         with atomic_write(folder) as unfinished, warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*None", UserWarning)  # of details left out
@@ -225,39 +236,17 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
                 minari.create_dataset_from_buffers(
                     dataset_id,
                     [],
-                    observation_space=spaces.Dict(observations),
+                    observation_space=spaces.Dict(observation),
                     action_space=spaces.Discrete(1),
                     jpeg_encoding=False,
                     **{"description": DESCRIPTION, **details},
                 )
-                folder.rename(unfinished)  # a dotted folder, which Minari does not list
-            except BaseException:
-                shutil.rmtree(folder, ignore_errors=True)
-                raise
+            finally:  # a dotted folder, which Minari does not list and which goes if this fails
+                if folder.exists():
+                    folder.rename(unfinished)
             storage = MinariStorage.read(unfinished / "data")
-            storage.update_episodes(_buffers(demos, sentences))
+            storage.update_episodes(buffers())
             storage.update_metadata({ABSENT: True})
     except (ValueError, AssertionError) as error:  # a detail that Minari does not take, for one
         raise UserError(f"{dataset_id!r} cannot be written: {error}") from None
     return minari.load_dataset(dataset_id)
-
-
-def _buffers(demos: Demonstrations, sentences: list[str]) -> Iterator[EpisodeBuffer]:
-    from minari.data_collector import EpisodeBuffer
-
-    for number, sentence in enumerate(sentences):
-        frames = rgb(demos[number]["pixels"])
-        steps = len(frames) - 1
-        yield EpisodeBuffer(
-            observations={IMAGE: frames, INSTRUCTION: [sentence] * len(frames)},
-            actions=np.zeros(steps, np.int64),
-            rewards=np.zeros(steps),
-            terminations=np.arange(steps) == steps - 1,
-            truncations=np.zeros(steps, bool),
-        )
-
-
-def _minari() -> Any:
-    with extra("minari", "this needs Minari"):
-        import minari
-    return minari

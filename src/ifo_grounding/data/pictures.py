@@ -14,25 +14,25 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import naming
-from ifo_grounding.data._images import (
-    BROKEN,
-    MODES,
-    SUFFIXES,
-    animation_frames,
-    open_image,
-    stack_images,
-)
+from ifo_grounding.data._episodes import Episode, naming
+from ifo_grounding.data._images import MODES, SUFFIXES, Source, animation_frames, stack_images
 from ifo_grounding.data._video import read_video, write_video
 from ifo_grounding.data.buffers import refuse_empty
 from ifo_grounding.data.demonstrations import Demonstrations
-from ifo_grounding.data.listing import LIST, VIDEOS, Listed, read_list
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.files import atomic_write
 
+LIST = "episodes.jsonl"
+VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
+READ = (".gif", *VIDEOS, *SUFFIXES)
+"""Suffixes of files that hold all frames of an episode."""
 KINDS = ("png", "mp4")
 COLOURS = (1, 3)
 FRAMES_PER_SECOND = 4
+
+Listed = tuple[str, Path, Any, bool]
+"""Name, frames (a folder of pictures, an animated picture or a video), instruction, and whether
+the recording was cut before the demonstrator stopped."""
 
 
 def load_pictures(
@@ -48,11 +48,8 @@ def load_pictures(
     recording that was cut, whose last frame is no stop.
 
     Frames that are numbered have to be numbered evenly: a missing one is an error. Each picture of
-    a GIF is one frame, however long it lasts.
-
-    Frames are read one episode after the other: the pixels of all episodes are never in memory
-    together. A video is lossy: its frames are those that a player shows, not those that were
-    recorded, and a repeated last frame may come back a little different.
+    a GIF is one frame, however long it lasts. The pixels of one episode are in memory at a time.
+    A video is lossy: a repeated last frame may come back a little different.
 
     Args:
         folder: where from.
@@ -66,59 +63,88 @@ def load_pictures(
             be.
     """
     check_choice("channels", channels, MODES)
-    shown = (
-        (one.name, stack_images(one.name, _images(one), channels), one.instruction, one.cut)
-        for one in tqdm(read_list(Path(folder)), desc="read", disable=not progress)
-    )
-    return Demonstrations.from_episodes(shown, **options)
+
+    def episodes() -> Iterator[Episode]:
+        listed = tqdm(read_list(Path(folder)), desc="read", disable=not progress)
+        for name, path, instruction, cut in listed:
+            with naming(name):
+                frames = stack_images(_frames(path), channels)
+            yield name, frames, instruction, cut
+
+    return Demonstrations.from_episodes(episodes(), **options)
 
 
-def _images(episode: Listed) -> Iterator[tuple[str, Image.Image]]:
-    """Yield name and image of each frame."""
-    path = episode.path
-    if path.suffix.lower() in VIDEOS and not path.is_dir():
-        with naming(episode.name):
-            for number, frame in enumerate(read_video(path)):
-                yield f"{path.name}, frame {number}", frame
-        return
+def read_list(folder: Path) -> list[Listed]:
+    """Read the list of a folder's episodes; refuse one with a line that is not as it has to be."""
+    path = folder / LIST
+    if not path.is_file():
+        raise UserError(
+            f"{path} does not exist: write one line per episode, such as "
+            '{"episode": "0001", "instruction": "go to the red ball"}'
+        )
     try:
-        if path.is_dir():
-            for path in _frame_files(episode):
-                with open_image(path) as opened:
-                    _check_single(episode.name, path, opened)
-                    yield path.name, opened
-            return
-        for number, frame in animation_frames(path):
-            yield f"{path.name}, frame {number}", frame
-    except UserError:
-        raise
-    except BROKEN as error:
-        raise UserError(f"episode {episode.name!r}: {path} cannot be read ({error})") from None
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} cannot be read ({error}): save it as UTF-8") from None
+    episodes: dict[str, Listed] = {}
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            entry = json.loads(line)
+            name, instruction = str(entry["episode"]), entry["instruction"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            raise UserError(
+                f"{path}, line {number}: a line is a JSON object with 'episode' and 'instruction'"
+            ) from None
+        if name in episodes:
+            raise UserError(f"{path} lists episode {name!r} twice")
+        with naming(name):
+            frames = _where(folder / str(entry.get("frames") or name))
+        episodes[name] = name, frames, instruction, bool(entry.get("truncated", False))
+    if not episodes:
+        raise UserError(f"{path} lists no episode")
+    return list(episodes.values())
 
 
-def _frame_files(episode: Listed) -> list[Path]:
+def _where(path: Path) -> Path:
+    """Return where the frames of an episode lie: at a path, or in a file of that name."""
+    if not path.exists():
+        suffixes = (each for suffix in READ for each in (suffix, suffix.upper()))
+        files = (path.with_name(path.name + suffix) for suffix in suffixes)
+        path = next(filter(Path.exists, files), path)
+    if not path.exists():
+        raise UserError(f"it has no frames: neither {path} nor a file such as {path}.mp4 exists")
+    if path.is_file() and path.suffix.lower() not in READ:
+        raise UserError(
+            f"{path} is of a kind that is not read: give a folder of pictures, or one of "
+            f"{', '.join(READ)}"
+        )
+    return path
+
+
+def _frames(path: Path) -> Iterator[tuple[str, Source]]:
+    """Yield the frames of an episode, each with its name."""
+    if path.is_dir():
+        yield from ((file.name, file) for file in _frame_files(path))
+        return
+    frames = read_video(path) if path.suffix.lower() in VIDEOS else animation_frames(path)
+    for number, frame in enumerate(frames):
+        yield f"{path.name}, frame {number}", frame
+
+
+def _frame_files(folder: Path) -> list[Path]:
     """Return the files of a folder that are its frames, in order."""
-    found = list(episode.path.iterdir())
+    found = list(folder.iterdir())
     paths = sorted((path for path in found if path.suffix.lower() in SUFFIXES), key=_natural)
     if not paths:
         others = sorted({path.suffix for path in found if path.suffix})
         raise UserError(
-            f"episode {episode.name!r} has no frames: {episode.path} holds none of "
-            + ", ".join(SUFFIXES)
+            f"{folder} holds none of {', '.join(SUFFIXES)}"
             + (f", but {', '.join(others)}" if others else "")
         )
-    _check_numbers(episode.name, paths)
+    _check_numbers(paths)
     return paths
-
-
-def _check_single(name: str, path: Path, image: Image.Image) -> None:
-    """Refuse an animation where a frame should be. A photo may hold others, such as a preview."""
-    count = getattr(image, "n_frames", 1)
-    if count > 1 and image.format != "MPO":
-        raise UserError(
-            f"episode {name!r}: {path.name} holds {count} pictures, and each file of a folder is "
-            "one frame: save them one by one, or name the file itself as the frames"
-        )
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
@@ -127,7 +153,7 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
     return [int(part) if at % 2 else part for at, part in enumerate(parts)], path.name
 
 
-def _check_numbers(name: str, paths: list[Path]) -> None:
+def _check_numbers(paths: list[Path]) -> None:
     """Refuse frames, in order, that are all numbered but not evenly."""
     found = [re.fullmatch("(.*?)([0-9]+)", path.stem, re.DOTALL) for path in paths]
     numbered = [(match[1], match[2]) for match in found if match]
@@ -135,20 +161,17 @@ def _check_numbers(name: str, paths: list[Path]) -> None:
         return
     numbers = [int(digits) for _, digits in numbered]
     steps = [later - number for number, later in pairwise(numbers)]
-    if 0 in steps:
-        at = steps.index(0)
-        raise UserError(
-            f"episode {name!r}: {paths[at].name} and {paths[at + 1].name} have the same number: "
-            "remove one of them"
-        )
-    usual = min(steps, default=0)
+    usual = min(steps, default=1)
     for at, step in enumerate(steps):
-        if step > usual:
+        pair = paths[at].name, paths[at + 1].name
+        if not step:
+            raise UserError(f"{' and '.join(pair)} have the same number: remove one of them")
+        if step > usual > 0:
             before, digits = numbered[at]
             missing = f"{before}{numbers[at] + usual:0{len(digits)}d}{paths[at].suffix}"
             raise UserError(
-                f"episode {name!r}: {missing} is missing between {paths[at].name} and "
-                f"{paths[at + 1].name}: restore it, or number the frames evenly"
+                f"{missing} is missing between {' and '.join(pair)}: restore it, or number the "
+                "frames evenly"
             )
 
 
@@ -173,7 +196,7 @@ def save_pictures(
     scale = at_least_one("scale", scale)
     sentences = written_sentences(demos, tuple(MODES) if kind == "png" else COLOURS)
     folder = Path(folder)
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+    if folder.is_file() or any(folder.glob("*")):
         raise UserError(
             f"{folder} exists and is no empty folder: name another one, or remove it first"
         )
@@ -185,35 +208,22 @@ def save_pictures(
             name = f"{number:0{digits}d}"
             lines.append(json.dumps({"episode": name, "instruction": sentence}))
             frames = rgb(demos[number]["pixels"]).repeat(scale, 1).repeat(scale, 2)
-            _save_episode(temporary / name, frames, kind)
+            if kind == "mp4":
+                write_video(temporary / f"{name}.mp4", frames, FRAMES_PER_SECOND)
+                continue
+            (temporary / name).mkdir()
+            for step, frame in enumerate(frames):
+                Image.fromarray(frame).save(temporary / name / f"{step:04d}.png")
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _save_episode(path: Path, frames: np.ndarray, kind: str) -> None:
-    if kind == "mp4":
-        write_video(path.with_suffix(".mp4"), frames, fps=FRAMES_PER_SECOND)
-        return
-    path.mkdir()
-    for step, frame in enumerate(frames):
-        Image.fromarray(frame).save(path / f"{step:04d}.png")
-
-
 def written_sentences(demos: Demonstrations, colours: tuple[int, ...] = COLOURS) -> list[str]:
-    """Return the instructions of demonstrations that can be written as pictures.
-
-    Raises:
-        UserError: where there is none, or one has no instruction, or frames are no pictures.
-    """
+    """Return the instructions; refuse demonstrations that cannot be written as pictures."""
     refuse_empty(len(demos))
     sentences = demos.sentences()
     if "" in sentences:
         raise UserError(f"demonstration {sentences.index('')} has no instruction: leave it out")
-    if demos.image_shape[0] not in colours:
-        *others, last = colours
-        raise UserError(
-            f"pictures have {', '.join(map(str, others))} or {last} colours, these frames have "
-            f"{demos.image_shape[0]}"
-        )
+    check_choice("number of channels", demos.image_shape[0], colours)
     return sentences
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any, Literal, overload
 
 import torch
@@ -74,7 +72,10 @@ def record_demonstrations(
     drawn = SceneStream(options, derive(seed, "demonstrations"), kept=1)
     parts: list[Tensor] = []
     lengths, instructions, actions = [], [], []
-    with _one_thread(), tqdm(total=n, desc="record", disable=not progress) as bar:
+    bar = tqdm(total=n, desc="record", disable=not progress)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # for steps this small, threads wait more than they work
+    try:
         for first in range(0, n, BATCH):
             batch = drawn.scenes(torch.arange(first, min(n, first + BATCH)))
             ties = generator(seed, "demonstrations", options.stream, "ties", first)
@@ -84,22 +85,14 @@ def record_demonstrations(
             lengths.append(batch.wanted.steps + 1)
             instructions.append(batch.instruction.to(torch.int16))
             bar.update(len(batch))
+    finally:
+        bar.close()
+        torch.set_num_threads(threads)
     numbering = generator(seed, "demonstrations", "tile numbers")
     codec, codes = FrameCodec.from_tiles(tile_table(tile_size), parts, numbering)
     tokens = torch.cat(instructions)
     demos = Demonstrations(codec, codes, torch.cat(lengths), tokens, vocabulary=VOCABULARY)
     return (demos, Truth(torch.cat(actions))) if keep_truth else demos
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch run on one thread: for steps this small, threads wait more than they work."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _demonstrate(scenes: Scene, ties: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -110,25 +103,21 @@ def _demonstrate(scenes: Scene, ties: torch.Generator) -> tuple[Tensor, Tensor]:
         actions of all episodes in a row, uint8 [F - episodes].
     """
     steps = scenes.wanted.steps
-    frame_ends = (steps + 1).cumsum(0)
-    action_ends = steps.cumsum(0)
+    frame_ends, action_ends = (steps + 1).cumsum(0), steps.cumsum(0)
     # Longest first, so that running episodes are always the first rows.
     steps, order = steps.sort(descending=True, stable=True)
     first_frame = (frame_ends - 1)[order] - steps
     first_action = action_ends[order] - steps
     wanted, state = scenes.wanted[order], scenes.state[order]
 
-    side = state.size
-    frames = torch.empty(int(frame_ends[-1]), side, side, dtype=torch.int16)
+    frames = torch.empty(int(frame_ends[-1]), state.size, state.size, dtype=torch.int16)
     actions = torch.empty(int(action_ends[-1]), dtype=torch.uint8)
     for time in range(int(steps[0]) + 1):
-        present = int((steps >= time).sum())
-        frames[first_frame[:present] + time] = tile_index(state[:present]).to(torch.int16)
+        frames[first_frame[: len(state)] + time] = tile_index(state).to(torch.int16)
         acting = int((steps > time).sum())
-        if not acting:
-            break
         wanted, state = wanted[:acting], state[:acting]
-        action = expert.act(state, wanted, ties)
-        actions[first_action[:acting] + time] = action.to(torch.uint8)
-        state = step(state, action)
+        if acting:
+            action = expert.act(state, wanted, ties)
+            actions[first_action[:acting] + time] = action.to(torch.uint8)
+            state = step(state, action)
     return frames, actions

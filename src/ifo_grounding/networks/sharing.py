@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from ifo_grounding.errors import UserError, extra
+from ifo_grounding.errors import UserError, optional
 from ifo_grounding.files import atomic_write, read_json, write_json
 from ifo_grounding.networks.building import Blueprint
 from ifo_grounding.networks.persistence import load, save
@@ -228,6 +228,4 @@ network = from_pretrained("path/to/this/folder")
 
 
 def _hub() -> Any:
-    with extra("hub", "the Hugging Face Hub needs an extra"):
-        import huggingface_hub
-    return huggingface_hub
+    return optional("huggingface_hub", extra="hub")

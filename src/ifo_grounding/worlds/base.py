@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth, load_pictures
-from ifo_grounding.data.listing import LIST
+from ifo_grounding.data.pictures import LIST
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Endings, SuitabilityResult
 from ifo_grounding.tasks import Vocabulary
