@@ -81,8 +81,7 @@ def test_what_becomes_of_a_room_whose_mission_is_fulfilled(level):
 
 
 def test_the_bot_plays_the_rooms_of_the_environment():
-    outcomes = bot_outcomes("GoToObj", 3, seed=5)
-    assert outcomes.tolist() == [True] * 3
+    assert bot_outcomes("GoToObj", 3, seed=5).tolist() == [True] * 3
     with pytest.raises(UserError, match="unknown stream"):
         bot_outcomes("GoToObj", 3, stream="test")
     demos = record_babyai("GoToObj", 1, seed=0)

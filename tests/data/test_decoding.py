@@ -42,14 +42,9 @@ def test_entries_can_be_rows_of_shared_frames():
 
 def test_samples_follow_the_tables_to_their_device():
     lookups = Lookup(CODES, ["pixels"]), Lookup(torch.arange(40).float(), ["name"])
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(40),
-        transform=Compose(*lookups, FrameDecoder(CODEC, ["pixels"])),
-        batch_size=4,
-    )
-    buffer.extend(TensorDict({"pixels": torch.arange(40), "name": torch.arange(40)}, [40]))
-    buffer.transform.to("meta")
-    sample = buffer.sample()
+    transform = Compose(*lookups, FrameDecoder(CODEC, ["pixels"])).to("meta")
+    entries = {"pixels": torch.arange(4), "name": torch.arange(4)}
+    sample = transform(TensorDict(entries, [4], device="cpu"))
     assert sample["pixels"].device.type == sample["name"].device.type == "meta"
     assert sample["pixels"].shape == (4, 3, 48, 48)
     assert sample["name"].dtype == torch.float32

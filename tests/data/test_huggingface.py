@@ -19,8 +19,6 @@ datasets.disable_progress_bars()
 
 def test_a_dataset_comes_back_as_it_was(demos, tmp_path):
     dataset = to_huggingface(demos, cache_dir=tmp_path / "cache")
-    assert dataset.num_rows == 12
-    assert dataset.column_names == ["frames", "instruction"]
     assert dataset[3]["instruction"] == demos.sentences()[3]
     assert dataset[3]["frames"][0].size == (48, 48)
     back = from_huggingface(dataset, vocabulary=VOCABULARY)

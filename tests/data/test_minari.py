@@ -98,8 +98,6 @@ def test_actions_are_never_read(folder):
         pyarrow.parquet.write_table(
             pyarrow.parquet.read_table(path, columns=["observations"], partitioning=None), path
         )
-    with pytest.raises(KeyError):
-        table[0]
     assert torch.equal(all_frames(from_minari(table, image="view")), all_frames(expected))
 
 

@@ -67,7 +67,6 @@ def test_pictures_come_back_as_they_were(demos, tmp_path):
 def test_videos_show_every_frame_at_twice_the_size(demos, tmp_path):
     demos = demos[:2]
     save_pictures(demos, tmp_path / "shown", kind="mp4", scale=2)
-    assert {path.suffix for path in (tmp_path / "shown").iterdir()} == {".mp4", ".jsonl"}
     back = load_pictures(tmp_path / "shown", close=False)
     assert back.sentences() == demos.sentences()
     assert torch.equal(back.lengths, demos.lengths)
@@ -81,7 +80,7 @@ def test_pictures_come_back_with_as_many_channels(channels, tmp_path):
     frames = torch.randint(256, (4, channels, 16, 24), dtype=torch.uint8)
     save_pictures(Demonstrations.from_arrays([frames], ["go on"]), tmp_path / "shown")
     back = load_pictures(tmp_path / "shown", channels=channels, close=False)
-    assert torch.equal(back[0]["pixels"], frames)
+    assert torch.equal(all_frames(back), frames)
 
 
 @pytest.mark.parametrize(
@@ -132,11 +131,9 @@ def test_animations_show_each_frame_or_are_refused_where_they_are_cut_short(tmp_
             load_pictures(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("suffix", "codec"),
-    [("mkv", "libx264"), ("avi", "mpeg4"), ("mov", "libx264"), ("mp4", "mjpeg")],
-)
-def test_videos_are_whole_or_refused(suffix, codec, tmp_path):
+@pytest.mark.parametrize("suffix", ["mkv", "avi", "mov", "mp4"])
+def test_videos_are_whole_or_refused(suffix, tmp_path):
+    codec = {"avi": "mpeg4", "mp4": "mjpeg"}.get(suffix, "libx264")
     path = make_video(tmp_path / f"a.{suffix}", size=(64, 64), codec=codec)
     list_of(tmp_path, "a")
     assert load_pictures(tmp_path, close=False).lengths.tolist() == [20]
