@@ -70,8 +70,7 @@ def record_demonstrations(
     check_choice("tile size", tile_size, TILE_SIZES)
     n = at_least_one("the number of demonstrations", n)
     options = SceneOptions(task=task, **scenes)
-    # Every scene is asked for once, in order.
-    drawn = SceneStream(options, derive(seed, "demonstrations"), kept=1)
+    drawn = SceneStream(options, derive(seed, "demonstrations"))
     parts: list[Tensor] = []
     lengths, instructions, actions = [], [], []
     with _one_thread(), tqdm(total=n, desc="record", disable=not progress) as bar:
@@ -123,7 +122,7 @@ def _demonstrate(scenes: Scene, ties: torch.Generator) -> tuple[Tensor, Tensor]:
     actions = torch.empty(int(action_ends[-1]), dtype=torch.uint8)
     for time in range(int(steps[0]) + 1):
         present = int((steps >= time).sum())
-        frames[first_frame[:present] + time] = tile_index(state[:present]).to(torch.int16)
+        frames[first_frame[:present] + time] = tile_index(state[:present])
         acting = int((steps > time).sum())
         if not acting:
             break

@@ -167,8 +167,7 @@ def collect_transitions(
         n: steps to take, at least; all environments of the batch step together. The buffer holds
             fewer where unchanged ones are dropped.
         stop_probability: probability of the stop; by default all actions are equally likely.
-        stop_action: which action is the stop; by default the environment's ``stop_action``. Where
-            that is None, none is.
+        stop_action: by default that of the environment; none where that is None.
         drop_unchanged: whether to leave out unchanged transitions other than stops.
         seed: of the actions; scenes are drawn by the environment.
         progress: whether to show a bar.
