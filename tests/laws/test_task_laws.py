@@ -48,8 +48,9 @@ def test_success_is_that_of_the_plain_rules(asked, seed, patience):
     for time in range(25):
         chance = torch.randint(6, (ROWS,), generator=draw)
         state = step(state, torch.where(slips & (time >= patience), chance, act(state, wanted)))
-        rows = zip(plain(start), plain(state), wishes(goal), strict=True)
-        assert achieved(start, state, goal).tolist() == [holds(*row) for row in rows]
+        if time % 8 == 0:
+            rows = zip(plain(start), plain(state), wishes(goal), strict=True)
+            assert achieved(start, state, goal).tolist() == [holds(*row) for row in rows]
 
 
 @law

@@ -16,8 +16,8 @@ from reference import holds, plain, shortest, wishes
 @pytest.mark.parametrize(
     ("layout", "scenes", "longest"),
     [
-        (Layout(size=3, objects=(2, 3), boxes=(2, 3), inside=0.7), 12, 40),
-        (Layout(size=4, objects=(2, 3), boxes=(2, 2), inside=0.7), 4, 40),
+        (Layout(size=3, objects=(2, 3), boxes=(2, 3), inside=0.7), 6, 40),
+        (Layout(size=4, objects=(2, 3), boxes=(2, 2), inside=0.7), 3, 40),
         (Layout(), 5, 8),
     ],
 )

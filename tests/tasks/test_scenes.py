@@ -25,6 +25,13 @@ from ifo_grounding.tasks.scenes import CHUNK
 from ifo_grounding.world import COLOURS, SHAPES, Layout, render
 
 
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch):
+    """One chunk at a time; of several side by side only one test is about."""
+    monkeypatch.setattr(module, "AHEAD", 1)
+    monkeypatch.setattr(streams, "BLOCK", CHUNK)
+
+
 def first(n: int, seed: int = 0, **options) -> Scene:
     return SceneStream(SceneOptions(**options), seed).scenes(torch.arange(n))
 
@@ -64,10 +71,10 @@ def test_a_number_names_one_scene_in_any_order():
     "options", [{"task": "pick"}, {"instructed": False}, {"split": "zero-shot"}]
 )
 def test_chunks_that_are_drawn_side_by_side_are_those_drawn_alone(monkeypatch, options):
-    together = first(3 * CHUNK, **options)
-    monkeypatch.setattr(module, "AHEAD", 1)
-    monkeypatch.setattr(streams, "BLOCK", CHUNK)
-    assert same(together, first(3 * CHUNK, **options))
+    alone = first(3 * CHUNK, **options)
+    monkeypatch.setattr(module, "AHEAD", 3)
+    monkeypatch.setattr(streams, "BLOCK", 3 * CHUNK)
+    assert same(alone, first(3 * CHUNK, **options))
 
 
 def test_scenes_stay_what_they_are():
