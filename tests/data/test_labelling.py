@@ -17,7 +17,6 @@ from ifo_grounding.data import (
 )
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import make_inverse
-from ifo_grounding.tasks import TASKS
 
 
 class WatchTheArm(nn.Module):
@@ -45,7 +44,7 @@ def inverse() -> TensorDictModule:
     return TensorDictModule(WatchTheArm(), ["pixels", ("next", "pixels")], ["logits"])
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", ["move-udlr", "pick"])
 def test_labels_are_what_the_expert_did(task, inverse):
     demos, truth = record_demonstrations(task, 60, keep_truth=True)
     buffer, report = label_demonstrations(demos, inverse, batch_size=100, progress=False)

@@ -141,10 +141,11 @@ def _propose(options: SceneOptions, draws: list[torch.Generator]) -> tuple[_Prop
 
 def _said(found: _Proposal, options: SceneOptions) -> Scene:
     """Return scenes with a sentence for each goal, or with a plan and words of zeros."""
+    wanted: Any = found.wanted
     if options.instructed:
-        wanted, said = found.wanted, grammar(options.task).encode(found.goal, found.wording)
+        said = grammar(options.task).encode(found.goal, found.wording)
     else:
-        wanted = torch.zeros_like(found.wanted)
+        wanted = torch.zeros_like(wanted)
         said = torch.zeros(len(found), VOCABULARY.length, dtype=torch.int64)
     return Scene(found.state, wanted, said, batch_size=found.batch_size)
 

@@ -63,7 +63,7 @@ class SceneStream:
         """Return blocks of scenes, one after the other, and the places of some scenes there."""
         blocks, which = (numbers // BLOCK).unique(return_inverse=True)
         parts: list[Any] = [self._block(block) for block in blocks.tolist() or [0]]
-        every = parts[0] if len(parts) == 1 else torch.cat(parts)
+        every: Any = parts[0] if len(parts) == 1 else torch.cat(parts)
         return every, which * BLOCK + numbers % BLOCK
 
     def _block(self, block: int) -> Scene:
