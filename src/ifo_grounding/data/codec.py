@@ -133,10 +133,7 @@ class FrameCodec:
 
     @classmethod
     def from_tiles(
-        cls,
-        tiles: Tensor,
-        parts: list[Tensor],
-        generator: torch.Generator | None = None,
+        cls, tiles: Tensor, parts: list[Tensor], generator: torch.Generator | None = None
     ) -> tuple[FrameCodec, Tensor]:
         """Return a codec and codes from tile numbers that a renderer gave.
 
@@ -154,8 +151,6 @@ class FrameCodec:
         >>> codec.decode(codes)[0, 0, ::8, ::8].tolist(), len(codec.tiles)
         ([[0, 2], [2, 2]], 2)
         """
-        if not parts:
-            raise UserError("no frames: give at least one part, integer [F, rows, columns]")
         given = join(parts, parts[0].dtype)
         used = torch.zeros(len(tiles), dtype=torch.bool)
         for piece in given.split(PIECE_FRAMES):

@@ -102,8 +102,7 @@ class Demonstrations:
             frames: one uint8 array [T + 1, C, H, W] per episode; a generator is read in pieces.
             instructions: token ids, integer [N, L], or sentences.
             vocabulary: the words of the sentences or tokens; by default that of the sentences.
-            length: words that the longest sentence may have, without a vocabulary; by default
-                those of the longest that occurs.
+            length: as of :meth:`from_episodes`, where there are sentences.
             tile_size: of the codec; the cheapest one by default.
 
         Raises:

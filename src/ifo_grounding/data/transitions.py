@@ -124,10 +124,7 @@ class Collected(NamedTuple):
     def load(cls, folder: str | Path, **options: Any) -> Collected:
         """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`.
 
-        Args:
-            folder: where from.
-            options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``generator``; a
-                ``transform`` comes after frames are decoded.
+        Options are as of :func:`collect_transitions`.
         """
         names = ("pixels", "next_pixels", "action", "taken", "kept")
         arrays, facts = load_folder(folder, KIND, names, ("tiles",))
