@@ -117,7 +117,7 @@ def world_pixels() -> Row:
         return batch * steps
 
     def naive(state) -> torch.Tensor:
-        tiles = table[tile_index(state)]  # [N, rows, columns, C, T, T]
+        tiles = table[tile_index(state).long()]  # [N, rows, columns, C, T, T]
         return tiles.permute(0, 3, 1, 4, 2, 5).reshape(batch, 3, 48, 48)
 
     frames = render(first)

@@ -33,7 +33,7 @@ def test_drawing_beats_whole_tiles():
     state, table = random_layout(1024), tile_table()
 
     def plain():
-        tiles = table[tile_index(state)]
+        tiles = table[tile_index(state).long()]
         return tiles.permute(0, 3, 1, 4, 2, 5).reshape(len(state), 3, 48, 48)
 
     assert torch.equal(render(state), plain())

@@ -45,6 +45,20 @@ def at_least_one(name: str, value: object) -> int:
     return number
 
 
+def check_below(what: str, values: Any, count: int) -> None:
+    """Refuse an integer tensor that holds other numbers than ``0 .. count - 1``.
+
+    >>> import torch
+    >>> check_below("actions hold", torch.tensor([3, 9]), 6)
+    Traceback (most recent call last):
+    ifo_grounding.errors.UserError: actions hold 9: allowed are 0..5
+    """
+    if values.numel():
+        low, high = (int(end) for end in values.aminmax())
+        if low < 0 or high >= count:
+            raise UserError(f"{what} {low if low < 0 else high}: allowed are 0..{count - 1}")
+
+
 def check_numbers(config: Any, unbounded: Iterable[str] = ()) -> None:
     """Refuse values of a dataclass that are no numbers where its fields say ``int`` or ``float``.
 

@@ -6,13 +6,10 @@ tiles and permuting them afterwards.
 
 from __future__ import annotations
 
-import functools
 import math
 
 import torch
 from torch import Tensor
-
-from ifo_grounding.errors import UserError
 
 PIXELS_PER_WORD = 8
 CHUNK_BYTES = 4 << 20
@@ -33,31 +30,18 @@ def as_words(pixels: Tensor) -> Tensor:
     return row.view(torch.int64)
 
 
-def words(tiles: Tensor) -> Tensor:
-    """View tiles, uint8 [N, C, T, T], as int64 words [N, C, T, T / 8].
-
-    Raises:
-        UserError: where T is not a multiple of 8, or tiles are not uint8.
-    """
-    if tiles.dtype != torch.uint8 or tiles.ndim != 4:
-        raise UserError(f"tiles must be uint8 [N, C, T, T], got {tiles.dtype} {list(tiles.shape)}")
-    if tiles.shape[-1] % PIXELS_PER_WORD:
-        raise UserError(f"tile size must be a multiple of 8, got {tiles.shape[-1]}")
-    return as_words(tiles)
-
-
 def assemble(table: Tensor, index: Tensor) -> Tensor:
     """Lay tiles side by side.
 
     Args:
-        table: tiles as :func:`words`, int64 [N, C, T, W].
+        table: tiles as :func:`as_words`, int64 [N, C, T, W].
         index: which tile at which place, integer [*B, rows, columns].
 
     Returns:
         Pixels, uint8 [*B, C, rows * T, columns * T].
 
     >>> tiles = torch.arange(2, dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 8, 8)
-    >>> assemble(words(tiles), torch.tensor([[0, 1]]))[0, 0].tolist()
+    >>> assemble(as_words(tiles), torch.tensor([[0, 1]]))[0, 0].tolist()
     [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
     """
     channels, size, width = table.shape[1:]
@@ -85,52 +69,22 @@ def _laid(planes: Tensor, index: Tensor, width: int) -> Tensor:
     return planes.expand(*shape[:4], -1).gather(4, places.expand(shape)).view(torch.uint8)
 
 
-def lay(pixels: Tensor, table: Tensor, places: Tensor, tiles: Tensor) -> None:
+def lay(pixels: Tensor, table: Tensor, places: tuple[Tensor, ...], tiles: Tensor) -> None:
     """Lay tiles at some places of pictures that :func:`assemble` made.
 
     Args:
         pixels: uint8 [N, C, rows * T, columns * T], written to.
-        table: tiles as :func:`words`, int64 [K, C, T, W].
-        places: where, each once: picture, row and column as one number, int64 [M].
-        tiles: which, int64 [M].
+        table: tiles as :func:`as_words`, int64 [K, C, T, W].
+        places: picture, row and column of each, int64 [M].
+        tiles: which, integer [M].
 
-    >>> table = words(torch.arange(2, dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 8, 8))
+    >>> table = as_words(torch.arange(2, dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 8, 8))
     >>> pixels = assemble(table, torch.tensor([[[0, 0]]]))
-    >>> lay(pixels, table, torch.tensor([1]), torch.tensor([1]))
+    >>> lay(pixels, table, torch.tensor([[0], [0], [1]]).unbind(), torch.tensor([1]))
     >>> pixels[0, 0, 0].tolist()
     [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
     """
-    rows, columns = (side // table.shape[2] for side in pixels.shape[-2:])
-    first, rest = _words_of_tiles(*table.shape[1:], rows, columns, str(pixels.device))
-    picture = places.div(len(first), rounding_mode="floor")
-    begin = first.index_select(0, places - picture * len(first))
-    begin.add_(picture, alpha=len(first) * len(rest))
-    drawn = table.flatten(1).index_select(0, tiles)
-    put(pixels.view(torch.int64).view(-1), (begin.unsqueeze(-1) + rest).view(-1), drawn.view(-1))
-
-
-def put(values: Tensor, index: Tensor, new: Tensor) -> None:
-    """Write new values [M] to some places of others [N], each once.
-
-    On a CPU ``put_`` takes half as long as ``scatter_``, or twice as long, as the machine may be;
-    but it is none of PyTorch's deterministic algorithms.
-
-    >>> values = torch.zeros(3)
-    >>> put(values, torch.tensor([2, 0]), torch.tensor([1.0, 2.0]))
-    >>> values.tolist()
-    [2.0, 0.0, 1.0]
-    """
-    if torch.are_deterministic_algorithms_enabled():
-        values.scatter_(0, index, new)
-    else:
-        values.put_(index, new)
-
-
-@functools.cache
-def _words_of_tiles(
-    channels: int, size: int, width: int, rows: int, columns: int, device: str
-) -> tuple[Tensor, Tensor]:
-    """Return the first word of each place of a picture, and where a tile's words follow it."""
-    words = torch.arange(channels * rows * size * columns * width, device=device)
-    words = words.view(channels, rows, size, columns, width)
-    return words[0, :, 0, :, 0].flatten(), words[:, 0, :, 0].flatten()
+    size, width = table.shape[2:]
+    laid = pixels.view(torch.int64).unflatten(-1, (-1, width)).unflatten(-3, (-1, size))
+    laid = laid.permute(0, 2, 4, 1, 3, 5)  # [N, rows, columns, C, T, W]
+    laid[places] = table.index_select(0, tiles.long())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,15 +36,16 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 
 
 def draw_rows(
-    draw: Callable[[int, torch.Generator | None], Tensor], n: int, source: Generators
+    draw: Callable[..., Tensor], shape: Sequence[int], source: Generators, **options: Any
 ) -> Tensor:
-    """Return ``draw(n, generator)``, or of several generators what each draws, its share of n.
+    """Return ``draw(shape, generator=source)``; of several generators each draws its share of rows.
 
     >>> pair = [generator(0, "left"), generator(0, "right")]
-    >>> rows = draw_rows(lambda n, g: torch.rand(n, 2, generator=g), 6, pair)
+    >>> rows = draw_rows(torch.rand, (6, 2), pair)
     >>> bool((rows[3:] == torch.rand(3, 2, generator=generator(0, "right"))).all())
     True
     """
     if source is None or isinstance(source, torch.Generator):
-        return draw(n, source)
-    return torch.cat([draw(n // len(source), each) for each in source])
+        return draw(shape, generator=source, **options)
+    share = (shape[0] // len(source), *shape[1:])
+    return torch.cat([draw(share, generator=each, **options) for each in source])

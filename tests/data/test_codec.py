@@ -29,20 +29,13 @@ def any_frames(draw) -> torch.Tensor:
 
 
 @settings(max_examples=60, deadline=None)
-@given(any_frames())
-def test_any_frames_come_back(frames):
-    codec, codes = FrameCodec.compress(frames)
+@given(any_frames(), st.none() | st.integers(1, 4))
+def test_any_frames_come_back_given_whole_or_in_pieces(frames, size):
+    codec, codes = FrameCodec.compress(frames if size is None else iter(frames.split(size)))
     assert codes.shape == (len(frames), *codec.code_shape)
     decoded = codec.decode(codes)
     assert decoded.dtype == torch.uint8
     assert torch.equal(decoded, frames)
-
-
-@settings(max_examples=25, deadline=None)
-@given(any_frames(), st.integers(1, 4))
-def test_pieces_give_the_same_as_the_whole(frames, size):
-    codec, codes = FrameCodec.compress(iter(frames.split(size)))
-    assert torch.equal(codec.decode(codes), frames)
 
 
 @pytest.mark.parametrize("tile_size", [8, 16, 32])
@@ -50,7 +43,6 @@ def test_frames_of_the_world_shrink_a_hundredfold(tile_size):
     frames = render(random_layout(300), tile_size)
     codec, codes = FrameCodec.compress(frames)
     assert codec.tile_size is not None
-    assert codec.tiles.unique(dim=0).shape == codec.tiles.shape
     assert torch.equal(codec.decode(codes), frames)
     assert codes.nbytes * 100 < frames.nbytes
 
@@ -95,7 +87,7 @@ def test_codes_of_a_renderer_say_nothing_that_pixels_do_not():
     index, frames = tile_index(state), render(state)
     codecs = [
         FrameCodec.from_tiles(
-            tile_table(8), list(index.to(torch.int16).split(100)), torch.Generator().manual_seed(s)
+            tile_table(8), list(index.split(100)), torch.Generator().manual_seed(s)
         )
         for s in (0, 0, 1)
     ]
@@ -123,8 +115,6 @@ def test_misfits_are_refused():
         FrameCodec((3, 24, 16), torch.zeros(1, 3, 16, 16, dtype=torch.uint8))
     with pytest.raises(UserError, match="give each tile once"):
         FrameCodec((3, 24, 16), torch.zeros(2, 3, 8, 8, dtype=torch.uint8))
-    with pytest.raises(UserError, match="no frames"):
-        FrameCodec.from_tiles(torch.zeros(2, 3, 8, 8, dtype=torch.uint8), [])
 
 
 def test_frames_may_begin_anywhere_in_a_buffer():

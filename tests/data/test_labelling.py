@@ -17,7 +17,6 @@ from ifo_grounding.data import (
 )
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import make_inverse
-from ifo_grounding.tasks import TASKS
 
 
 class WatchTheArm(nn.Module):
@@ -45,7 +44,7 @@ def inverse() -> TensorDictModule:
     return TensorDictModule(WatchTheArm(), ["pixels", ("next", "pixels")], ["logits"])
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", ["move-udlr", "pick"])
 def test_labels_are_what_the_expert_did(task, inverse):
     demos, truth = record_demonstrations(task, 60, keep_truth=True)
     buffer, report = label_demonstrations(demos, inverse, batch_size=100, progress=False)
@@ -55,11 +54,9 @@ def test_labels_are_what_the_expert_did(task, inverse):
     assert len(buffer) == demos.transitions
 
 
-@pytest.mark.parametrize("task", ["move", "pick-out"])
-@pytest.mark.parametrize("preset", ["strong"])
-def test_labels_read_from_tiles_are_those_read_from_pixels(task, preset, monkeypatch):
-    demos = record_demonstrations(task, 40)
-    model = make_inverse(demos, preset, seed=0)
+def test_labels_read_from_tiles_are_those_read_from_pixels(monkeypatch):
+    demos = record_demonstrations("pick-out", 40)
+    model = make_inverse(demos, seed=0)
     network = type(model.module)
     read = []
     from_tiles = network.from_tiles
@@ -142,31 +139,21 @@ def test_the_report_says_how_sure_the_model_was(inverse):
     }  # fmt: skip
 
 
-def test_a_saved_report_makes_the_buffer_again(tmp_path, inverse):
-    demos = record_demonstrations("move", 10)
-    _, report = label_demonstrations(demos, inverse, progress=False)
-    report.save(tmp_path / "labels")
-    loaded = LabelReport.load(tmp_path / "labels")
-    assert torch.equal(loaded.actions, report.actions)
-    assert torch.equal(loaded.confidence, report.confidence)
-    assert loaded.n_actions == 6
-    buffer = labelled_buffer(demos, loaded.actions)
-    assert torch.equal(buffer[:]["action"], report.actions.long())
-    with pytest.raises(UserError, match="were they made for these demonstrations"):
-        labelled_buffer(demos[:5], loaded.actions)
-
-
 @pytest.mark.parametrize(("n_actions", "dtype"), [(256, torch.uint8), (300, torch.int32)])
-def test_labels_fit_any_number_of_actions(tmp_path, n_actions, dtype):
+def test_a_saved_report_of_any_number_of_actions_makes_the_buffer_again(tmp_path, n_actions, dtype):
     demos = record_demonstrations("move", 3)
     last = torch.arange(n_actions) == n_actions - 1
     sure = TensorDictModule(lambda x: last.float().expand(len(x), -1), ["pixels"], ["logits"])
-    buffer, report = label_demonstrations(demos, sure, device="cpu", progress=False)
-    assert report.actions.dtype == dtype
-    assert report.counts[-1] == demos.transitions
-    assert (buffer[:]["action"] == n_actions - 1).all()
+    _, report = label_demonstrations(demos, sure, device="cpu", progress=False)
     report.save(tmp_path / "labels")
-    assert torch.equal(LabelReport.load(tmp_path / "labels").actions, report.actions)
+    loaded = LabelReport.load(tmp_path / "labels")
+    assert torch.equal(loaded.actions, report.actions) and loaded.actions.dtype == dtype
+    assert torch.equal(loaded.confidence, report.confidence)
+    assert loaded.counts[-1] == demos.transitions and len(loaded.counts) == n_actions
+    buffer = labelled_buffer(demos, loaded.actions)
+    assert (buffer[:]["action"] == n_actions - 1).all()
+    with pytest.raises(UserError, match="were they made for these demonstrations"):
+        labelled_buffer(demos[:2], loaded.actions)
 
 
 def test_bad_input_is_refused(inverse):
@@ -183,10 +170,6 @@ def test_bad_input_is_refused(inverse):
     flat = TensorDictModule(lambda pixels: pixels.float().flatten(2), ["pixels"], ["logits"])
     with pytest.raises(UserError, match=r"wrote \[\d+, 3, 2304\] at 'logits'"):
         label_demonstrations(demos, flat, progress=False)
-
-
-def test_a_model_that_broke_labels_nothing():
-    demos = record_demonstrations("move", 3)
-    inverse = TensorDictModule(WatchTheArm(torch.nan), ["pixels", ("next", "pixels")], ["logits"])
+    inverse.module.logit.data.fill_(torch.nan)
     with pytest.raises(UserError, match="not all finite"):
         label_demonstrations(demos, inverse, progress=False)

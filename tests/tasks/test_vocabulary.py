@@ -88,5 +88,5 @@ def test_a_vocabulary_whose_words_keep_punctuation_keeps_it():
 
 @pytest.mark.parametrize("token", [-1, 3])
 def test_what_is_no_token_has_no_word(token):
-    with pytest.raises(UserError, match=f"token {token} is no word"):
+    with pytest.raises(UserError, match=f"the vocabulary has no token {token}: allowed are 0..2"):
         Vocabulary(["a", "b"]).decode(torch.tensor([[1, token]]))

@@ -29,19 +29,13 @@ def test_counts_are_uniform_within_their_bounds(drawn):
         assert uniform(counts[low:]) > 1e-4
 
 
-def test_boxes_of_a_scene_have_different_colours(drawn):
-    for colour in range(1, 8):
-        assert ((drawn.boxes == colour).sum(-1) <= 1).all()
-
-
-def test_every_colour_and_kind_is_equally_likely(drawn):
+def test_colours_kinds_and_arms_are_equally_likely(drawn):
     assert uniform(drawn.boxes[drawn.boxes > 0].bincount()[1:]) > 1e-4
     assert uniform(drawn.objects[drawn.objects > 0].bincount()[1:]) > 1e-4
-
-
-def test_the_arm_starts_anywhere_with_an_empty_hand(drawn):
     assert uniform(drawn.arm.bincount(minlength=36)) > 1e-4
     assert not drawn.held.any()
+    for colour in range(1, 8):  # boxes of a scene differ
+        assert ((drawn.boxes == colour).sum(-1) <= 1).all()
 
 
 def test_every_cell_is_equally_likely(drawn):
@@ -74,12 +68,11 @@ def test_the_share_inside_boxes_can_be_chosen():
     assert ((state.objects > 0) == (state.boxes > 0)).all()
 
 
-@pytest.mark.parametrize("size", range(3, 11))
+@pytest.mark.parametrize("size", [3, 10])
 def test_grids_of_other_sizes(size):
     layout = Layout(size=size, objects=(2, 5), boxes=(1, 4))
     state = random_layout(300, layout, generator=torch.Generator().manual_seed(size))
     assert state.size == size
-    assert state.objects.shape == (300, size * size)
     objects, boxes = (state.objects > 0).sum(-1), (state.boxes > 0).sum(-1)
     assert (objects.min(), objects.max(), boxes.min(), boxes.max()) == (2, 5, 1, 4)
     assert state.arm.max() == size * size - 1

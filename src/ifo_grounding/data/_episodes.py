@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_below
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 PIECE_FRAMES = 512
@@ -80,11 +80,9 @@ class Reader:
             raise UserError(f"episode {name!r} has no instruction (found {found}): give a sentence")
         words = len(sentence.split())
         if words > self.length:
-            longer = "length=" if self.vocabulary is None else "a vocabulary with length="
-            do = "shorten it" if words > MOST_WORDS else f"give {longer}{words}"
             raise UserError(
                 f"episode {name!r} has an instruction of {words} words, {self.length} are allowed: "
-                + do
+                "shorten it, or give a longer length, or a vocabulary that has one"
             )
         if self.vocabulary is not None:
             with naming(name):
@@ -92,7 +90,7 @@ class Reader:
         return sentence
 
     def _frames(self, name: Name, given: Frames, close: bool) -> Tensor:
-        frames = check_frames(name, given)
+        frames = _checked(name, given)
         shape = list(frames.shape[1:])
         first, expected = self._first = self._first or (name, shape)
         if shape != expected:
@@ -110,13 +108,8 @@ def _kind(value: object) -> str:
     return f"a {type(value).__name__}{sized}"
 
 
-def check_frames(name: Name, given: Frames) -> Tensor:
-    """Return frames of an episode as a tensor.
-
-    Raises:
-        UserError: naming the episode, where they are not uint8 [T + 1, C, H, W], as far as that can
-            be seen: colours last are refused.
-    """
+def _checked(name: Name, given: Frames) -> Tensor:
+    """Return frames as a tensor, where they are as they have to be, as far as can be seen."""
     if given is None:
         raise UserError(f"episode {name!r} has no frames")
     try:
@@ -128,27 +121,18 @@ def check_frames(name: Name, given: Frames) -> Tensor:
     except (TypeError, ValueError, RuntimeError):
         raise UserError(f"episode {name!r}: its frames are not arrays of one size") from None
     shape = list(frames.shape)
-    if not frames.numel():
-        wrong = f"is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at least one frame"
-    elif frames.is_floating_point():
-        scaled = "255 * frames" if frames.max() <= 1 else "frames"
-        wrong = (
-            f"is {frames.dtype} {shape} of {frames.min():g} to {frames.max():g}: give uint8 "
-            f"[T + 1, C, H, W], such as np.round({scaled}).astype(np.uint8)"
+    if frames.dtype != torch.uint8 or frames.ndim != 4 or not frames.numel():
+        raise UserError(
+            f"episode {name!r} is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at "
+            "least one frame; C is 1 for grey, 3 for colours, 4 with alpha; of floats in 0..1 "
+            "np.round(255 * frames).astype(np.uint8)"
         )
-    elif frames.dtype != torch.uint8 or frames.ndim != 4:
-        wrong = (
-            f"is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at least one frame; C is "
-            "1 for grey, 3 for colours, 4 with alpha"
+    if shape[-1] < LEAST_SIDE <= min(shape[1:3]):
+        raise UserError(
+            f"episode {name!r} has images {shape[1:]}, with the colours last: give "
+            "[T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"
         )
-    elif shape[-1] < LEAST_SIDE <= min(shape[1:3]):
-        wrong = (
-            f"has images {shape[1:]}, with the colours last: give [T + 1, C, H, W], such as "
-            "frames.transpose(0, 3, 1, 2)"
-        )
-    else:
-        return frames
-    raise UserError(f"episode {name!r} {wrong}")
+    return frames
 
 
 @contextlib.contextmanager
@@ -172,13 +156,7 @@ def check_parts(frames: int, lengths: Tensor, instructions: Tensor, vocabulary_s
         )
     if instructions.dtype.is_floating_point:
         raise UserError(f"instructions must be integer token ids, got {instructions.dtype}")
-    if instructions.numel():
-        low, high = (int(value) for value in instructions.aminmax())
-        if low < 0 or high >= vocabulary_size:
-            raise UserError(
-                f"instructions hold token {low if low < 0 else high}: the vocabulary has ids "
-                f"0..{vocabulary_size - 1}"
-            )
+    check_below("instructions hold token", instructions, vocabulary_size)
 
 
 def padded(instructions: Tensor, vocabulary: Vocabulary) -> Tensor:

@@ -96,10 +96,10 @@ def frame_buffer(
         stored: entries [N, ...]: numbers of frames at ``frame_keys``, the number of the episode at
             ``instruction``, and whatever else.
         frame_keys: which entries are frames.
-        options: for ``TensorDictReplayBuffer``; a ``transform`` comes after frames are decoded.
+        options: as of :func:`encoded_buffer`.
 
     Raises:
-        UserError: where there is no demonstration, or no entry, or a ``storage`` is given.
+        UserError: where there is no demonstration, or no entry.
     """
     refuse_empty(len(demos))
     refuse_empty(len(stored[keys.INSTRUCTION]), "transitions")
@@ -113,15 +113,9 @@ def frame_buffer(
 def encoded_buffer(
     entries: TensorDict, transforms: list[Transform], options: dict[str, Any]
 ) -> TensorDictReplayBuffer:
-    """Put entries that are encoded already into a buffer, which decodes what is sampled.
+    """Put entries [N] that are encoded already into a buffer, which decodes what is sampled.
 
-    Args:
-        entries: what to store, [N].
-        transforms: what decodes it, in order.
-        options: for ``TensorDictReplayBuffer``; a ``transform`` sees what is decoded.
-
-    Raises:
-        UserError: where a ``storage`` is given.
+    A ``transform`` among the options sees what is decoded; a ``storage`` is a :class:`UserError`.
     """
     if "storage" in options:
         raise UserError(

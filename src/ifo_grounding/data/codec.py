@@ -13,7 +13,7 @@ from ifo_grounding import mosaic
 from ifo_grounding.data import _spool
 from ifo_grounding.data._spool import Spool, join
 from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_below
 
 TILE_SIZES = (8, 16, 32, 64)
 CODE_DTYPES = (torch.uint8, torch.int16, torch.int32)
@@ -52,29 +52,28 @@ class FrameCodec:
         channels, height, width = (int(side) for side in image_shape)
         self.image_shape = (channels, height, width)
         self.tile_size: int | None = None
-        self._index: _TileIndex | None = None
+        self.words: Tensor | None = None
+        """Tiles as 64-bit words, int64 [N, C, T, T / 8]; None where the codec is raw."""
+        self._numbers: dict[bytes, int] = {}
         if tiles is not None:
-            self._index = _TileIndex(mosaic.words(tiles.cpu()).flatten(1))
             side = self.tile_size = int(tiles.shape[-1])
-            if tiles.shape[1:] != (channels, side, side) or height % side or width % side:
+            fits = tiles.shape[1:] == (channels, side, side) and not (height % side or width % side)
+            if not fits or tiles.dtype != torch.uint8 or side % mosaic.PIXELS_PER_WORD:
                 raise UserError(
-                    f"tiles {list(tiles.shape)} do not cover images {list(self.image_shape)}: "
-                    f"give [N, {channels}, T, T] with T a divisor of height and width"
+                    f"tiles {tiles.dtype} {list(tiles.shape)} do not cover images "
+                    f"{list(self.image_shape)}: give uint8 [N, {channels}, T, T] with T a multiple "
+                    "of 8 and a divisor of height and width"
                 )
+            self.words = mosaic.as_words(tiles.cpu())
+            rows = enumerate(self.words.numpy())
+            self._numbers = {row.tobytes(): number for number, row in rows}
+            if len(self._numbers) != len(tiles):
+                raise UserError("tiles are not distinct: give each tile once")
 
     @property
     def tiles(self) -> Tensor | None:
         """Distinct tiles, uint8 [N, C, T, T]; None where the codec is raw."""
-        words = self.words
-        return None if words is None else words.view(torch.uint8)
-
-    @property
-    def words(self) -> Tensor | None:
-        """Tiles as 64-bit words, int64 [N, C, T, T / 8]; None where the codec is raw."""
-        if self._index is None or self.tile_size is None:
-            return None
-        shape = (-1, self.image_shape[0], self.tile_size, self.tile_size // mosaic.PIXELS_PER_WORD)
-        return self._index.words.view(len(self._index), *shape[1:])
+        return None if self.words is None else self.words.view(torch.uint8)
 
     @property
     def code_shape(self) -> tuple[int, ...]:
@@ -87,13 +86,11 @@ class FrameCodec:
     @property
     def code_dtype(self) -> torch.dtype:
         """Smallest integer type that holds every tile number."""
-        return torch.uint8 if self._index is None else smallest_dtype(len(self._index))
+        return torch.uint8 if self.words is None else smallest_dtype(len(self.words))
 
     def __repr__(self) -> str:
-        shape = "x".join(map(str, self.image_shape))
-        if self._index is None:
-            return f"FrameCodec({shape}, raw)"
-        return f"FrameCodec({shape}, {len(self._index)} tiles of {self.tile_size})"
+        kind = "raw" if self.words is None else f"{len(self.words)} tiles of {self.tile_size}"
+        return f"FrameCodec({'x'.join(map(str, self.image_shape))}, {kind})"
 
     @classmethod
     def compress(
@@ -114,13 +111,12 @@ class FrameCodec:
         Raises:
             UserError: for images of another type or shape, or a tile size that does not fit them.
         """
-        total = len(frames) if isinstance(frames, Tensor) else None
-        pieces = iter([frames] if isinstance(frames, Tensor) else frames)
+        pieces = map(_checked, [frames] if isinstance(frames, Tensor) else frames)
         first = next(pieces, None)
         if first is None:
             raise UserError("no frames: give at least one piece, uint8 [F, C, H, W]")
-        image_shape = _checked(first).shape[1:]
-        codec = cls._empty(image_shape, _tile_size(first, total or len(first), tile_size))
+        image_shape = first.shape[1:]
+        codec = cls._empty(image_shape, _tile_size(first, tile_size))
         patience = PATIENCE_BYTES // max(image_shape.numel(), 1)
         codes = Spool()
         seen = 0
@@ -137,18 +133,15 @@ class FrameCodec:
 
     @classmethod
     def from_tiles(
-        cls,
-        tiles: Tensor,
-        parts: list[Tensor],
-        generator: torch.Generator | None = None,
+        cls, tiles: Tensor, parts: list[Tensor], generator: torch.Generator | None = None
     ) -> tuple[FrameCodec, Tensor]:
         """Return a codec and codes from tile numbers that a renderer gave.
 
-        Tiles that no frame shows are left out, equal ones become one, and numbers are drawn at
-        random: codes then say nothing that pixels do not.
+        Tiles that no frame shows are left out, and numbers are drawn at random: codes then say
+        nothing that pixels do not.
 
         Args:
-            tiles: pictures, uint8 [N, C, T, T].
+            tiles: pictures, all different, uint8 [N, C, T, T].
             parts: tile numbers, integer [F, rows, columns] each. The list is emptied on the way, so
                 that numbers and codes are not both in memory.
             generator: decides the new numbers.
@@ -158,67 +151,72 @@ class FrameCodec:
         >>> codec.decode(codes)[0, 0, ::8, ::8].tolist(), len(codec.tiles)
         ([[0, 2], [2, 2]], 2)
         """
-        if not parts:
-            raise UserError("no frames: give at least one part, integer [F, rows, columns]")
         given = join(parts, parts[0].dtype)
         used = torch.zeros(len(tiles), dtype=torch.bool)
         for piece in given.split(PIECE_FRAMES):
             used[piece.flatten().long()] = True
-        distinct = _TileIndex(torch.empty(0, tiles[0].numel() // mosaic.PIXELS_PER_WORD).long())
-        numbers = torch.zeros(len(tiles), dtype=torch.int64)
-        numbers[used] = distinct.add(mosaic.words(tiles[used]).flatten(1))
-        order = torch.randperm(len(distinct), generator=generator)
-        shown = distinct.words[order].view(torch.uint8).view(-1, *tiles.shape[1:])
-        rows, columns = (tiles.shape[-1] * count for count in given.shape[1:])
-        codec = cls((tiles.shape[1], rows, columns), shown)
-        numbers = order.argsort()[numbers].to(codec.code_dtype)
+        shown = used.nonzero().squeeze(-1)
+        shown = shown[torch.randperm(len(shown), generator=generator)]
+        height, width = (tiles.shape[-1] * count for count in given.shape[1:])
+        codec = cls((tiles.shape[1], height, width), tiles[shown])
+        numbers = torch.zeros(len(tiles), dtype=codec.code_dtype)
+        numbers[shown] = torch.arange(len(shown)).to(codec.code_dtype)
         codes = [numbers[piece.long()] for piece in given.split(PIECE_FRAMES)]
         return codec, join(codes, codec.code_dtype)
 
     def decode(self, codes: Tensor) -> Tensor:
         """Return the pixels of ``codes`` [*B, *code_shape], uint8 [*B, C, H, W]."""
-        words = self.words
-        return codes if words is None else mosaic.assemble(words.to(codes.device), codes)
+        if self.words is None:
+            return codes
+        return mosaic.assemble(self.words.to(codes.device), codes)
 
     def check(self, codes: Tensor) -> None:
-        """Refuse codes, [F, *code_shape], that this codec cannot have made.
-
-        Raises:
-            UserError: that says what they are and what they should be.
-        """
-        if codes.shape[1:] != self.code_shape or codes.dtype.is_floating_point:
+        """Refuse codes, [F, *code_shape], that this codec cannot have made."""
+        raw = self.words is None
+        fits = codes.dtype == torch.uint8 if raw else not codes.is_floating_point()
+        if codes.shape[1:] != self.code_shape or not fits:
+            kind = "uint8" if raw else "integers"
             raise UserError(
-                f"codes are {codes.dtype} {list(codes.shape)}, {self} makes integers "
+                f"codes are {codes.dtype} {list(codes.shape)}, {self} makes {kind} "
                 f"[F, {', '.join(map(str, self.code_shape))}]"
             )
-        if self._index is None:
-            if codes.dtype != torch.uint8:
-                raise UserError(f"codes of {self} are the pixels, uint8, got {codes.dtype}")
-        elif codes.numel():
-            low, high = (int(value) for value in codes.aminmax())
-            if low < 0 or high >= len(self._index):
-                raise UserError(
-                    f"codes hold tile {low if low < 0 else high}: the dictionary has "
-                    f"{len(self._index)}"
-                )
+        if not raw:
+            check_below("codes hold tile", codes, len(self._numbers))
 
     def _encode(self, frames: Tensor) -> Tensor:
         """Add the tiles of ``frames`` [F, C, H, W] to the dictionary and return their codes.
 
         Earlier codes stay valid; their type may become too small for the later ones.
         """
-        if _checked(frames).shape[1:] != self.image_shape:
+        if frames.shape[1:] != self.image_shape:
             raise UserError(
                 f"frames are {list(frames.shape[1:])}, the first ones are {list(self.image_shape)}"
             )
-        if self._index is None or self.tile_size is None:
+        if self.tile_size is None:
             return frames.cpu()
         parts = []
         frames = frames.cpu().reshape(-1, *self.image_shape)  # strides as words need them
         for piece in frames.split(max(1, CHUNK_BYTES // math.prod(self.image_shape))):
-            numbers = self._index.add(_cut(piece, self.tile_size))
+            numbers = self._number(_cut(piece, self.tile_size))
             parts.append(numbers.to(self.code_dtype))
         return join(parts, self.code_dtype).view(-1, *self.code_shape)
+
+    def _number(self, rows: Tensor) -> Tensor:
+        """Return the numbers of tiles as rows of words [M, K], int64 [M], adding new tiles."""
+        assert self.words is not None
+        distinct, index = distinct_rows(rows)
+        known = len(self._numbers)
+        numbers = torch.tensor(
+            [
+                self._numbers.setdefault(row.tobytes(), len(self._numbers))
+                for row in distinct.numpy()
+            ],
+            dtype=torch.int64,
+        )
+        if len(self._numbers) > known:
+            new = distinct[numbers >= known].view(-1, *self.words.shape[1:])
+            self.words = torch.cat([self.words, new])
+        return numbers[index]
 
     @classmethod
     def _empty(cls, image_shape: Sequence[int], tile_size: int | None) -> FrameCodec:
@@ -232,10 +230,9 @@ class FrameCodec:
 
         The dictionary is always in memory: one beyond the bound counts as endless.
         """
-        if self._index is None or not frames:
+        if self.words is None or not frames:
             return 0.0
-        pixels = math.prod(self.image_shape)
-        tiles = self._index.words.nbytes
+        pixels, tiles = math.prod(self.image_shape), self.words.nbytes
         codes = frames * math.prod(self.code_shape) * self.code_dtype.itemsize
         return math.inf if tiles > _spool.MEMORY_BYTES else (tiles + codes) / (frames * pixels)
 
@@ -253,41 +250,6 @@ def _cut(frames: Tensor, tile_size: int) -> Tensor:
     return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)
 
 
-class _TileIndex:
-    """Distinct rows of words and their numbers, in the order in which they were added.
-
-    Args:
-        words: distinct rows, int64 [N, K].
-
-    Raises:
-        UserError: where a row comes twice.
-    """
-
-    def __init__(self, words: Tensor) -> None:
-        self.words = words
-        self._numbers = {row.tobytes(): number for number, row in enumerate(words.numpy())}
-        if len(self._numbers) != len(words):
-            raise UserError("tiles are not distinct: give each tile once")
-
-    def __len__(self) -> int:
-        return len(self.words)
-
-    def add(self, rows: Tensor) -> Tensor:
-        """Return the numbers of ``rows`` [M, K], int64 [M], adding those that are new."""
-        distinct, index = distinct_rows(rows)
-        known = len(self)
-        numbers = torch.tensor(
-            [
-                self._numbers.setdefault(row.tobytes(), len(self._numbers))
-                for row in distinct.numpy()
-            ],
-            dtype=torch.int64,
-        )
-        if len(self._numbers) > known:
-            self.words = torch.cat([self.words, distinct[numbers >= known]])
-        return numbers[index]
-
-
 def smallest_dtype(count: int) -> torch.dtype:
     """Return the smallest of uint8, int16 and int32 that holds ``0 .. count - 1``."""
     return next(dtype for dtype in CODE_DTYPES if count - 1 <= torch.iinfo(dtype).max)
@@ -301,7 +263,7 @@ def _checked(frames: Tensor) -> Tensor:
     return frames
 
 
-def _tile_size(frames: Tensor, total: int, asked: int | None) -> int | None:
+def _tile_size(frames: Tensor, asked: int | None) -> int | None:
     """Return the tile size that seems cheapest on a sample of the frames; None where none fits."""
     height, width = frames.shape[-2:]
     fitting = [size for size in TILE_SIZES if height % size == 0 and width % size == 0 and height]
@@ -312,12 +274,11 @@ def _tile_size(frames: Tensor, total: int, asked: int | None) -> int | None:
                 f"choose one of {fitting}, or none for pixels as they are"
             )
         return asked
-    if len(fitting) < 2 or not len(frames):
-        return fitting[0] if fitting else None
-    sample = frames[:: -(-len(frames) // SAMPLE_FRAMES)]
-    costs = {}
-    for size in fitting:
+    sample = frames[:: max(1, -(-len(frames) // SAMPLE_FRAMES))]
+
+    def cost(size: int) -> float:
         codec = FrameCodec._empty(frames.shape[1:], size)
-        code = codec._encode(sample)[0]
-        costs[size] = (0 if codec.words is None else codec.words.nbytes) + total * code.nbytes
-    return min(costs, key=costs.__getitem__)
+        codec._encode(sample)
+        return codec._share(len(frames))
+
+    return min(fitting, key=cost, default=None)

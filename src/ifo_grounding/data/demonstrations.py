@@ -18,7 +18,6 @@ from ifo_grounding.data._episodes import Episode, Reader, check_parts, padded, r
 from ifo_grounding.data._spool import same_rows, take
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
-from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError, whole
 from ifo_grounding.seeding import generator as seeded
 from ifo_grounding.tasks.vocabulary import Vocabulary
@@ -103,8 +102,7 @@ class Demonstrations:
             frames: one uint8 array [T + 1, C, H, W] per episode; a generator is read in pieces.
             instructions: token ids, integer [N, L], or sentences.
             vocabulary: the words of the sentences or tokens; by default that of the sentences.
-            length: words that the longest sentence may have, without a vocabulary; by default
-                those of the longest that occurs.
+            length: as of :meth:`from_episodes`, where there are sentences.
             tile_size: of the codec; the cheapest one by default.
 
         Raises:
@@ -216,7 +214,7 @@ class Demonstrations:
 
     def pool(self) -> Tensor:
         """Return the distinct instructions in lexical order of their tokens, int64 [P, L]."""
-        return distinct_rows(self.instructions)[0].unique(dim=0)
+        return self.instructions.unique(dim=0)
 
     @overload
     def __getitem__(self, index: int) -> TensorDict: ...
@@ -224,13 +222,8 @@ class Demonstrations:
     def __getitem__(self, index: slice | Tensor | Sequence[int]) -> Demonstrations: ...
     def __getitem__(self, index: Any) -> TensorDict | Demonstrations:
         """Return one demonstration, a TensorDict [T + 1], or a selection that shares the frames."""
-        if isinstance(index, str | tuple):
-            raise UserError(
-                f"demonstrations have no entry {index!r}: they hold pixels and instructions, which "
-                "demos[i], frames and instructions return"
-            )
         if not isinstance(index, slice) and not np.ndim(index):
-            index = whole("the number of a demonstration", index)
+            index = whole("a demonstration's number", index)
             if not -len(self) <= index < len(self):
                 raise IndexError(f"demonstration {index} of {len(self)}")
             first, length = int(self.starts[index]), int(self.lengths[index])
@@ -275,9 +268,9 @@ class Demonstrations:
         """Return frames by number [*B] (row of ``codes``), uint8 [*B, C, H, W]."""
         return self.codec.decode(self.codes[number.long().cpu()])
 
-    def first_frames(self, index: Tensor | slice = slice(None)) -> Tensor:
-        """Return the first frames of some episodes, uint8 [*B, C, H, W]."""
-        return self.frames(self.starts[index.cpu() if isinstance(index, Tensor) else index])
+    def first_frames(self) -> Tensor:
+        """Return the first frame of each episode, uint8 [N, C, H, W]."""
+        return self.frames(self.starts)
 
     def locate(self, transition: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the episode and the number of the first frame of transitions, int64 [*B] each.
@@ -293,10 +286,9 @@ class Demonstrations:
 
     def save(self, folder: str | Path) -> None:
         """Write a folder of ``.npy`` files and ``meta.json``; of a selection, its frames alone."""
-        in_a_row = torch.equal(self.starts, self.lengths.cumsum(0) - self.lengths)
-        whole = in_a_row and self.n_frames == len(self.codes)
         rows = row_numbers(self.starts, self.lengths, self.lengths)
-        codes = self.codes if whole else take(self.codes, rows)
+        in_a_row = torch.equal(rows, torch.arange(len(self.codes)))
+        codes = self.codes if in_a_row else take(self.codes, rows)
         arrays = {"codes": codes, "lengths": self.lengths, "instructions": self.tokens}
         if self.codec.tiles is not None:
             arrays["tiles"] = self.codec.tiles

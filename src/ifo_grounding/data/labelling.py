@@ -54,14 +54,11 @@ class LabelReport:
         """Return count, mean, and low quantiles of the confidence for each action."""
         rows = []
         for action, count in enumerate(self.counts.tolist()):
-            values = self.confidence[self.actions == action].double().numpy()
             row: dict[str, float] = {"action": action, "count": count}
             if count:
-                found = np.quantile(values, list(QUANTILES.values()), method="lower")
-                row |= {
-                    "mean": float(values.mean()),
-                    **dict(zip(QUANTILES, found.tolist(), strict=True)),
-                }
+                values = self.confidence[self.actions == action].double().numpy()
+                found = np.quantile(values, list(QUANTILES.values()), method="lower").tolist()
+                row |= dict(zip(("mean", *QUANTILES), (float(values.mean()), *found), strict=True))
             rows.append(row)
         return rows
 
@@ -98,21 +95,18 @@ def label_demonstrations(
 ) -> Labelled:
     """Label every transition of demonstrations with an inverse model (paper, "Labelling").
 
-    The model runs in eval mode without gradients; its mode is then what it was. One of
+    The model runs in eval mode without gradients. One of
     :func:`~ifo_grounding.networks.make_inverse` whose patches are the codec's tiles is shown these,
     with the same result: no picture is put together.
 
     Args:
-        demos: demonstrations.
+        demos: what is labelled.
         inverse: reads ``pixels`` and ``("next", "pixels")``, or two images of other names: the one
             below ``next``, else the second, is the later one. Logits [B, A] are its first output.
         batch_size: transitions at once.
         device: where to run; by default where the model is.
         progress: whether to show a bar.
         buffer_options: for :func:`labelled_buffer`.
-
-    Returns:
-        The labelled buffer, which decodes frames when sampled, and a report of confidence.
 
     Raises:
         UserError: where no episode has two frames, or the model writes no such logits.
@@ -202,8 +196,8 @@ def _logits(
     read = [unravel_key(key) for key in getattr(inverse, "in_keys", ())]
     if len(read) != 2:
         read = [keys.PIXELS, (keys.NEXT, keys.PIXELS)]
-    later = [isinstance(key, tuple) and key[0] == keys.NEXT for key in read]
-    numbers = [frame + 1, frame] if later == [True, False] else [frame, frame + 1]
+    later_first = isinstance(read[0], tuple) and read[0][0] == keys.NEXT
+    numbers = [frame + 1, frame] if later_first else [frame, frame + 1]
     reads_tiles = getattr(getattr(inverse, "module", None), "reads_tiles", None)
     if reads_tiles is not None and reads_tiles(demos.image_shape, demos.tile_size):
         parts = (demos.codec.tiles, *(demos.codes[each] for each in numbers))

@@ -68,8 +68,7 @@ def record_demonstrations(
     check_choice("tile size", tile_size, TILE_SIZES)
     n = at_least_one("the number of demonstrations", n)
     options = SceneOptions(task=task, **scenes)
-    # Every scene is asked for once, in order.
-    drawn = SceneStream(options, derive(seed, "demonstrations"), kept=1)
+    drawn = SceneStream(options, derive(seed, "demonstrations"))
     parts: list[Tensor] = []
     lengths, instructions, actions = [], [], []
     bar = tqdm(total=n, desc="record", disable=not progress)
@@ -113,7 +112,7 @@ def _demonstrate(scenes: Scene, ties: torch.Generator) -> tuple[Tensor, Tensor]:
     frames = torch.empty(int(frame_ends[-1]), state.size, state.size, dtype=torch.int16)
     actions = torch.empty(int(action_ends[-1]), dtype=torch.uint8)
     for time in range(int(steps[0]) + 1):
-        frames[first_frame[: len(state)] + time] = tile_index(state).to(torch.int16)
+        frames[first_frame[: len(state)] + time] = tile_index(state)
         acting = int((steps > time).sum())
         wanted, state = wanted[:acting], state[:acting]
         if acting:

@@ -124,10 +124,7 @@ class Collected(NamedTuple):
     def load(cls, folder: str | Path, **options: Any) -> Collected:
         """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`.
 
-        Args:
-            folder: where from.
-            options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``generator``; a
-                ``transform`` comes after frames are decoded.
+        Options are as of :func:`collect_transitions`.
         """
         names = ("pixels", "next_pixels", "action", "taken", "kept")
         arrays, facts = load_folder(folder, KIND, names, ("tiles",))
@@ -167,8 +164,7 @@ def collect_transitions(
         n: steps to take, at least; all environments of the batch step together. The buffer holds
             fewer where unchanged ones are dropped.
         stop_probability: probability of the stop; by default all actions are equally likely.
-        stop_action: which action is the stop; by default the environment's ``stop_action``. Where
-            that is None, none is.
+        stop_action: by default that of the environment; none where that is None.
         drop_unchanged: whether to leave out unchanged transitions other than stops.
         seed: of the actions; scenes are drawn by the environment.
         progress: whether to show a bar.

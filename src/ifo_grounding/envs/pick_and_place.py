@@ -17,7 +17,7 @@ from ifo_grounding import keys
 from ifo_grounding.envs.simulator import Simulator
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.tasks.goals import MAX_STEPS
-from ifo_grounding.tasks.scenes import STATE_LEAVES, Scene, SceneOptions
+from ifo_grounding.tasks.scenes import Scene, SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import N_BOXES, N_KINDS, Layout
 from ifo_grounding.world.tiles import TILE_SIZES
@@ -265,9 +265,7 @@ class PickAndPlaceEnv(EnvBase):
         if self.instructed:
             result[keys.INSTRUCTION] = self._simulator.instruction.clone()
         if self.expose_state:
-            state = self._simulator.state
-            leaves = {leaf: getattr(state, leaf).clone() for leaf in STATE_LEAVES}
-            result[STATE] = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+            result[STATE] = self._simulator.state.to_tensordict()
         return result
 
     def _set_seed(self, seed: int | None) -> None:

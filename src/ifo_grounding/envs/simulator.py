@@ -9,12 +9,7 @@ from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks.goals import Plan, fulfilled, plan
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.tasks.scenes import (
-    Scene,
-    SceneOptions,
-    plan_leaves,
-    state_leaves,
-)
+from ifo_grounding.tasks.scenes import Scene, SceneOptions, leaves
 from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.world import Canvas, WorldState, render, step
 
@@ -156,7 +151,7 @@ class Simulator:
         """
         goal = grammar(self.options.task).parse_tokens(tokens)
         wanted = plan(self.state[rows], goal, self.options.max_steps)
-        for leaf, new in zip(self._running.asked, [*plan_leaves(wanted), tokens], strict=True):
+        for leaf, new in zip(self._running.asked, [*leaves(wanted), tokens], strict=True):
             leaf.index_copy_(0, rows, new.to(leaf))
 
     @torch.inference_mode(False)
@@ -194,7 +189,7 @@ class _Episodes:
 
     def __init__(self, state: WorldState, wanted: Plan, instruction: Tensor) -> None:
         self.state, self.wanted, self.instruction = state, wanted, instruction
-        self.asked = [*plan_leaves(wanted), instruction]  # written to, and never replaced
+        self.asked = [*leaves(wanted), instruction]  # written to, and never replaced
 
     def __getstate__(self) -> tuple[WorldState, Plan, Tensor]:
         """Return what a copy is made of. Left alone, deepcopy shares the tensors of a state."""
@@ -206,4 +201,4 @@ class _Episodes:
 
     def leaves(self) -> list[Tensor]:
         """Everything that episodes are made of, as of scenes."""
-        return [*state_leaves(self.state), *self.asked]
+        return [*leaves(self.state), *self.asked]

@@ -29,10 +29,7 @@ def act(state: WorldState, wanted: Plan, generator: torch.Generator | None = Non
     columns = aim % size - state.arm % size
     to_go = rows.abs() + columns.abs()
     # A row step with this probability makes each shortest path equally likely.
-    draw = (
-        torch.rand(to_go.shape, generator=generator, device=to_go.device, dtype=torch.float32)
-        * to_go
-    )
+    draw = torch.empty_like(to_go, dtype=torch.float32).uniform_(generator=generator) * to_go
     vertical = torch.where(rows > 0, DOWN, UP)
     horizontal = torch.where(columns > 0, RIGHT, LEFT)
     action = torch.where(draw < rows.abs(), vertical, horizontal)

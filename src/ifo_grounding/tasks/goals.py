@@ -82,31 +82,23 @@ class Plan(TensorClass):
 
 def plan(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Plan:
     """Resolve what a goal refers to in an initial state, and say whether it suits."""
+    from_box, to_box = goal.task == PICK_OUT, (goal.task == PICK) | (goal.task == PICK_OUT)
+    beside_object = goal.task == PICK_UDLR
     is_object = _shows(state.objects, goal.object)
-    if (from_box := goal.task == PICK_OUT).any():
-        is_object = is_object & (~from_box.unsqueeze(-1) | _shows(state.boxes, goal.source))
-    places = _first(is_object)
-    counts = [is_object.sum(-1)]
-
-    anchor = places
-    to_box = (goal.task == PICK) | (goal.task == PICK_OUT)
-    if (beside_object := goal.task == PICK_UDLR).any():
-        is_reference = _shows(state.objects, goal.reference) & ~is_object  # nothing beside itself
-        anchor = torch.where(beside_object, _first(is_reference), places)
-        counts.append(torch.where(beside_object, is_reference.sum(-1), 1))
+    is_object &= ~from_box.unsqueeze(-1) | _shows(state.boxes, goal.source)
+    is_reference = _shows(state.objects, goal.reference) & ~is_object  # nothing beside itself
+    is_anchor = torch.where(beside_object.unsqueeze(-1), is_reference, is_object)
+    is_anchor = torch.where(to_box.unsqueeze(-1), _shows(state.boxes, goal.target), is_anchor)
+    places, anchor = _first(is_object), _first(is_anchor)
     beside, inside = neighbour(anchor, goal.side, state.size)
     destination = torch.where(goal.has_side, beside, anchor)
-    if to_box.any():
-        is_target = _shows(state.boxes, goal.target)
-        destination = torch.where(to_box, _first(is_target), destination)
-        counts.append(torch.where(to_box, is_target.sum(-1), 1))
     inside = inside | ~goal.has_side
 
     steps = _distance(state.arm, torch.where(goal.carries, places, destination), state.size) + 1
     steps = steps + goal.carries * (2 + _distance(places, destination, state.size))
     at_destination = state.objects.gather(-1, destination.unsqueeze(-1)).squeeze(-1)
     is_there = torch.where(goal.carries, places, state.arm) == destination
-    found = torch.stack(counts)
+    found = torch.stack([is_object.sum(-1), is_anchor.sum(-1)])
     checks = (
         ((found == 0).any(0), MISSING),
         ((found > 1).any(0), AMBIGUOUS),
@@ -172,7 +164,7 @@ def _equal(left: Tensor, right: Tensor) -> Tensor:
 
 def _shows(cells: Tensor, wanted: Tensor) -> Tensor:
     """Return which cells [*B, C] show what is wanted [*B], nowhere if that is 0."""
-    wanted = wanted.unsqueeze(-1)
+    wanted = wanted.to(cells.dtype).unsqueeze(-1)
     return (cells == wanted) & (wanted > 0)
 
 

@@ -4,71 +4,65 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.tasks.goals import (
-    MOVE_UDLR,
-    PICK,
-    PICK_OUT,
-    PICK_UDLR,
-    SIDES,
-    TASKS,
-    Goal,
-    check_task,
-)
+from ifo_grounding.tasks.goals import SIDES, TASKS, Goal, check_task
 from ifo_grounding.tasks.vocabulary import VOCABULARY, words_of
-from ifo_grounding.world import BOX_COLOURS, N_BOXES, N_KINDS, kind, kind_name
+from ifo_grounding.world import BOX_COLOURS, N_KINDS, kind, kind_name
 
-SIDE_WORDS = {
-    "above": "above",
-    "right": "to the right of",
-    "below": "below",
-    "left": "to the left of",
+KINDS = ("", *(kind_name(number) for number in range(1, N_KINDS + 1)))
+BOXES = ("", *BOX_COLOURS)
+NAMES = {
+    "object": KINDS,
+    "reference": KINDS,
+    "source": BOXES,
+    "target": BOXES,
+    "side": ("above", "to the right of", "below", "to the left of"),
 }
+"""What a sentence says of each field of a goal, by number."""
+FIELDS = tuple(NAMES)
+
+
+def _wordings(pattern: str, *choices: Iterable[str]) -> list[str]:
+    """Return a pattern with each ``%s`` filled in, in all ways."""
+    return [pattern % words for words in itertools.product(*choices)]
+
+
 PUTS = ("put", "place", "drop")
-FIELDS = ("object", "reference", "source", "target", "side")
-
-
-def _phrasings(task: str) -> tuple[str, ...]:
-    if task == "move":
-        return ("move to the {object}",)
-    if task == "move-udlr":
-        return ("move the arm {side} the {object}", "go to the cell {side} the {object}")
-    if task == "pick":
-        direct = [
-            f"{verb} the {{object}} {into} the {{target}} box"
-            for verb, into in itertools.product(PUTS, ("in", "into"))
-        ]
-        staged = [
-            f"pick up the {{object}} and {verb} it {into} the {{target}} box"
-            for verb, into in itertools.product(PUTS, ("in", "into"))
-        ]
-        return (*direct, *staged)
-    if task == "pick-out":
-        verbs = ("move", "bring", "carry", "transfer", "shift", "take")
-        direct = [
-            f"{verb} the {{object}} from the {{source}} box {into} the {{target}} box"
-            for verb, into in itertools.product(verbs, ("to", "into", "inside"))
-        ]
-        staged = [
-            f"{take} the {{object}} {'from' if take == 'remove' else 'out of'} the {{source}} box "
-            f"and {put} the {{target}} box"
-            for take, put in itertools.product(
-                ("take", "get", "pick", "lift", "pull", "remove"),
-                ("put it into", "place it in", "drop it in"),
-            )
-        ]
-        return (*direct, *staged)
-    direct = [f"{verb} the {{object}} {{side}} the {{reference}}" for verb in PUTS]
-    staged = [f"pick up the {{object}} and {verb} it {{side}} the {{reference}}" for verb in PUTS]
-    return (*direct, *staged)
-
-
-PHRASINGS = {task: _phrasings(task) for task in TASKS}
+INTO = ("in", "into")
+VERBS = ("move", "bring", "carry", "transfer", "shift", "take")
+TAKES = (
+    *_wordings("%s the {object} out of", ("take", "get", "pick", "lift", "pull")),
+    "remove the {object} from",
+)
+PHRASINGS = {
+    "move": ["move to the {object}"],
+    "move-udlr": ["move the arm {side} the {object}", "go to the cell {side} the {object}"],
+    "pick": [
+        *_wordings("%s the {object} %s the {target} box", PUTS, INTO),
+        *_wordings("pick up the {object} and %s it %s the {target} box", PUTS, INTO),
+    ],
+    "pick-out": [
+        *_wordings(
+            "%s the {object} from the {source} box %s the {target} box",
+            VERBS,
+            ("to", "into", "inside"),
+        ),
+        *_wordings(
+            "%s the {source} box and %s the {target} box",
+            TAKES,
+            ("put it into", "place it in", "drop it in"),
+        ),
+    ],
+    "pick-udlr": [
+        *_wordings("%s the {object} {side} the {reference}", PUTS),
+        *_wordings("pick up the {object} and %s it {side} the {reference}", PUTS),
+    ],
+}
 """Wordings of each task; a udlr task has each of them for each side."""
 N_TEMPLATES = {
     task: len(wordings) * (len(SIDES) if task.endswith("udlr") else 1)
@@ -121,38 +115,28 @@ class Grammar:
     def __init__(self, task: str) -> None:
         self.task = check_task(task)
         self.phrasings = PHRASINGS[task]
-        fields = list(_fillers(self.task))
-        table = torch.tensor(fields)
+        fields = _fields(self.phrasings[0])
         self.sentences = tuple(
-            _fill(phrasing, row) for row in fields for phrasing in self.phrasings
+            phrasing.format(**{name: NAMES[name][row[at]] for at, name in enumerate(FIELDS)})
+            for row in fields
+            for phrasing in self.phrasings
         )
         """Every sentence, goal by goal in all wordings."""
+        table = torch.tensor(fields)
         columns = table.repeat_interleave(len(self.phrasings), 0).unbind(-1)
-        task_column = torch.full_like(columns[0], self.task)
-        self.goals = Goal(
-            task=task_column,
-            **dict(zip(FIELDS, columns, strict=True)),
-            batch_size=task_column.shape,
-        )
+        tasks = torch.full_like(columns[0], self.task)
+        self.goals = Goal(tasks, *columns, batch_size=tasks.shape)
         """The goal of each sentence, [S]."""
         self.tokens = VOCABULARY.encode(self.sentences)
         """Token ids of every sentence, int64 [S, 16]."""
         self._by_sentence = {sentence: row for row, sentence in enumerate(self.sentences)}
-        self._goal_rows = torch.full((N_KINDS + 1, N_KINDS + 1, N_BOXES + 1, N_BOXES + 1, 4), -1)
+        self._goal_rows = torch.zeros([len(words) for words in NAMES.values()], dtype=torch.int64)
         self._goal_rows[tuple(table.unbind(-1))] = torch.arange(len(fields))
 
     def encode(self, goal: Goal, phrasing: Tensor) -> Tensor:
-        """Return the tokens of goals [*B] in the given wordings [*B], int64 [*B, 16]."""
-        if ((phrasing < 0) | (phrasing >= len(self.phrasings))).any():
-            raise UserError(
-                f"wordings of {TASKS[self.task]} have the numbers 0..{len(self.phrasings) - 1}"
-            )
-        index = tuple(getattr(goal, name).cpu() for name in FIELDS)
-        rows = self._goal_rows[index]
-        if (rows < 0).any():
-            raise UserError(f"no sentence of {TASKS[self.task]} expresses such a goal")
-        tokens = self.tokens[rows * len(self.phrasings) + phrasing.cpu()]
-        return tokens.to(goal.task.device)
+        """Return the tokens of goals of the task [*B] in some wordings [*B], int64 [*B, 16]."""
+        rows = self._goal_rows[tuple(getattr(goal, name) for name in FIELDS)]
+        return self.tokens[rows * len(self.phrasings) + phrasing]
 
     def parse(self, sentences: str | list[str]) -> Goal:
         """Return the goal of each sentence, [N].
@@ -182,30 +166,14 @@ def grammar(task: str) -> Grammar:
     return Grammar(task)
 
 
-def _fillers(task: int) -> Iterator[tuple[int, ...]]:
-    """Yield the fields of every goal of a task that a sentence can express."""
-    kinds, boxes = range(1, N_KINDS + 1), range(1, N_BOXES + 1)
-    sides = range(len(SIDES))
-    for item in kinds:
-        if task == MOVE_UDLR:
-            yield from ((item, 0, 0, 0, side) for side in sides)
-        elif task == PICK:
-            yield from ((item, 0, 0, box, 0) for box in boxes)
-        elif task == PICK_OUT:
-            yield from ((item, 0, *pair, 0) for pair in itertools.permutations(boxes, 2))
-        elif task == PICK_UDLR:
-            others = (other for other in kinds if other != item)
-            yield from ((item, other, 0, 0, side) for other in others for side in sides)
-        else:
-            yield (item, 0, 0, 0, 0)
-
-
-def _fill(phrasing: str, fields: tuple[int, ...]) -> str:
-    item, reference, source, target, side = fields
-    return phrasing.format(
-        object=kind_name(item),
-        reference=kind_name(reference) if reference else "",
-        source=BOX_COLOURS[source - 1],
-        target=BOX_COLOURS[target - 1],
-        side=SIDE_WORDS[SIDES[side]],
-    )
+def _fields(phrasing: str) -> list[tuple[int, ...]]:
+    """Return the fields of every goal that a wording can express."""
+    numbers = [
+        [number for number, word in enumerate(words) if word] if f"{{{name}}}" in phrasing else [0]
+        for name, words in NAMES.items()
+    ]
+    return [
+        (item, reference, source, target, side)
+        for item, reference, source, target, side in itertools.product(*numbers)
+        if item != reference and (source != target or not source)
+    ]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorClass
@@ -31,8 +32,6 @@ CHUNK = 1024
 """Scenes that one generator draws."""
 AHEAD = 8
 """Chunks that are drawn side by side, in half as long as one after another."""
-ROUNDS_HELD = 8
-"""Rounds of draws after which what was refused is let go of, for memory's sake."""
 PATIENCE = 1000
 """Draws of a chunk after which a layout counts as unable to hold a suitable goal."""
 
@@ -46,22 +45,6 @@ class Scene(TensorClass):
     """The goal resolved in it, [*B]."""
     instruction: Tensor
     """Tokens of a sentence for the goal, int64 [*B, 16]."""
-
-    @classmethod
-    def unasked(cls, state: WorldState) -> Scene:
-        """Return scenes [N] in which nothing is asked: a plan and words of zeros."""
-        nothing = torch.zeros_like(state.arm)
-        wanted = Plan(
-            verdict=nothing.clone(),
-            object_cell=nothing.clone(),
-            destination=nothing.clone(),
-            carries=nothing.bool(),
-            objects=torch.zeros_like(state.objects),
-            steps=nothing.clone(),
-            batch_size=state.batch_size,
-        )
-        words = nothing.new_zeros(*state.batch_size, VOCABULARY.length)
-        return cls(state=state, wanted=wanted, instruction=words, batch_size=state.batch_size)
 
 
 @dataclass(frozen=True)
@@ -86,7 +69,6 @@ class SceneOptions:
     """Actions per episode; a goal that needs more is unachievable."""
 
     def __post_init__(self) -> None:
-        """Refuse unknown names."""
         check_task(self.task)
         if not isinstance(self.layout, Layout):
             raise UserError(
@@ -103,11 +85,16 @@ class SceneOptions:
         if self.holdout_visible or self.split != "train":
             return self.layout
         excluded = (*self.layout.excluded_kinds, *holdout_kinds(self.holdout))
-        return Layout(**{**self.layout.__dict__, "excluded_kinds": excluded})
+        return replace(self.layout, excluded_kinds=excluded)
 
 
-STATE_LEAVES = tuple(each.name for each in fields(WorldState))
-PLAN_LEAVES = tuple(each.name for each in fields(Plan))
+class _Proposal(TensorClass):
+    """Scenes, and what might be said there."""
+
+    state: WorldState
+    wanted: Plan
+    goal: Goal
+    wording: Tensor
 
 
 def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
@@ -119,27 +106,18 @@ def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
     numbers = range(block * AHEAD, (block + 1) * AHEAD)
     draws = [generator(seed, "scenes", options.stream, number) for number in numbers]
     missing = torch.full((AHEAD,), CHUNK)
-    proposed: list[_Proposal] = []
-    rows: list[Tensor] = []
+    kept: list[Any] = []
     owners: list[Tensor] = []
     for _ in range(PATIENCE):
         unfinished = missing.nonzero().squeeze(-1)
-        sources = [draws[chunk] for chunk in unfinished]
-        proposal, good = _propose(options, sources)
+        proposal, good = _propose(options, [draws[chunk] for chunk in unfinished])
         good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
         missing[unfinished] -= good.sum(1)
-        before = sum(len(each.wording) for each in proposed)
-        owner, place = good.nonzero(as_tuple=True)
-        rows.append(before + owner * CHUNK + place)
-        proposed.append(proposal)
-        owners.append(unfinished[owner])
+        kept.append(proposal[good.flatten()])
+        owners.append(unfinished.repeat_interleave(good.sum(1)))
         if not missing.any():
-            order = torch.cat(owners).argsort(stable=True)
-            found = _chosen(proposed, torch.cat(rows)[order])
-            return _said(found, options.task) if options.instructed else Scene.unasked(found.state)
-        if len(proposed) == ROUNDS_HELD:
-            proposed = [_chosen(proposed, torch.cat(rows))]
-            rows = [torch.arange(len(proposed[0].wording))]
+            found: Any = torch.cat(kept)
+            return _said(found[torch.cat(owners).argsort(stable=True)], options)
     raise UserError(
         f"after {PATIENCE * CHUNK} draws only {CHUNK - int(missing.max())} scenes admit a "
         f"suitable goal of {options.task!r} in split {options.split!r} within "
@@ -154,55 +132,35 @@ def _propose(options: SceneOptions, draws: list[torch.Generator]) -> tuple[_Prop
     state = random_layout(n, options.shown_layout, generator=draws)
     goal = propose_goal(state, check_task(options.task), draws)
     wanted = plan(state, goal, options.max_steps)
-    if options.split != "all":
-        listed = in_split(goal, options.split, options.holdout)
-        wanted.verdict = torch.where(listed, wanted.verdict, -1)
-    wording = _integers(len(grammar(options.task).phrasings), n, draws)
-    good = wanted.verdict == SUITABLE
+    good = (wanted.verdict == SUITABLE) & in_split(goal, options.split, options.holdout)
     if not options.instructed:
         good = torch.ones_like(good)
-    return _Proposal(state, wanted, goal, wording), good.view(len(draws), CHUNK)
+    wording = _integers(len(grammar(options.task).phrasings), n, draws)
+    return _Proposal(state, wanted, goal, wording, batch_size=[n]), good.view(len(draws), CHUNK)
 
 
-class _Proposal(NamedTuple):
-    """Scenes, and what might be said there."""
-
-    state: WorldState
-    wanted: Plan
-    goal: Goal
-    wording: Tensor
-
-
-def _chosen(proposed: list[_Proposal], rows: Tensor) -> _Proposal:
-    """Return some scenes of several proposals, numbered one after the other."""
-    parts: list[Any] = [torch.cat(part)[rows] for part in zip(*proposed, strict=True)]
-    return _Proposal(*parts)
-
-
-def _said(proposal: _Proposal, task: str) -> Scene:
-    """Return scenes with a sentence for each goal."""
-    state, wanted, goal, wording = proposal
-    said = grammar(task).encode(goal, wording)
-    return Scene(state=state, wanted=wanted, instruction=said, batch_size=[len(wording)])
+def _said(found: _Proposal, options: SceneOptions) -> Scene:
+    """Return scenes with a sentence for each goal, or with a plan and words of zeros."""
+    wanted: Any = found.wanted
+    if options.instructed:
+        said = grammar(options.task).encode(found.goal, found.wording)
+    else:
+        wanted = torch.zeros_like(wanted)
+        said = torch.zeros(len(found), VOCABULARY.length, dtype=torch.int64)
+    return Scene(found.state, wanted, said, batch_size=found.batch_size)
 
 
 def _integers(high: int, n: int, source: Generators) -> Tensor:
-    return draw_rows(lambda n, draw: torch.randint(high, (n,), generator=draw), n, source)
+    return draw_rows(partial(torch.randint, high), (n,), source)
 
 
-def state_leaves(state: WorldState) -> list[Tensor]:
-    """Return what worlds are made of, always in the same order."""
-    return [getattr(state, each) for each in STATE_LEAVES]
-
-
-def plan_leaves(wanted: Plan) -> list[Tensor]:
-    """Return what plans are made of, always in the same order."""
-    return [getattr(wanted, each) for each in PLAN_LEAVES]
-
-
-def scene_leaves(scenes: Scene) -> list[Tensor]:
-    """Return what scenes are made of, always in the same order."""
-    return [*state_leaves(scenes.state), *plan_leaves(scenes.wanted), scenes.instruction]
+def leaves(whole: WorldState | Plan | Scene) -> list[Tensor]:
+    """Return what worlds, plans or scenes are made of, always in the same order."""
+    found: list[Tensor] = []
+    for each in fields(whole):
+        part = getattr(whole, each.name)
+        found += [part] if isinstance(part, Tensor) else leaves(part)
+    return found
 
 
 def propose_goal(state: WorldState, task: int, source: Generators) -> Goal:
@@ -210,13 +168,7 @@ def propose_goal(state: WorldState, task: int, source: Generators) -> Goal:
     shape = state.arm.shape
 
     def drawn() -> Tensor:
-        return draw_rows(
-            lambda n, draw: torch.rand(
-                n, state.objects.shape[-1], generator=draw, dtype=torch.float32
-            ),
-            len(state.arm),
-            source,
-        )
+        return draw_rows(torch.rand, state.objects.shape, source, dtype=torch.float32)
 
     def pick(mask: Tensor) -> Tensor:
         """Draw one true cell of each row."""

@@ -6,18 +6,17 @@ number, training and evaluation never meet, and results can name the scenes that
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
-from ifo_grounding.tasks.scenes import AHEAD, CHUNK, Scene, SceneOptions, draw_block, scene_leaves
+from ifo_grounding.tasks.scenes import AHEAD, CHUNK, Scene, SceneOptions, draw_block, leaves
 
 BLOCK = AHEAD * CHUNK
 """Scenes that are drawn at once."""
-BLOCKS_KEPT = 64
+BLOCKS_KEPT = 8
+"""Blocks that a stream remembers."""
 
 
 class SceneStream:
@@ -27,7 +26,6 @@ class SceneStream:
         options: which scenes.
         seed: of what is drawn.
         device: where scenes go; they are drawn on the CPU.
-        kept: how many blocks of scenes are remembered, the last that were asked for.
 
     >>> stream = SceneStream(SceneOptions("pick"), seed=0)
     >>> scenes = stream.scenes(torch.tensor([5, 2000]))
@@ -36,76 +34,41 @@ class SceneStream:
     """
 
     def __init__(
-        self,
-        options: SceneOptions,
-        seed: int,
-        device: torch.device | str | None = None,
-        *,
-        kept: int = BLOCKS_KEPT,
+        self, options: SceneOptions, seed: int, device: torch.device | str | None = None
     ) -> None:
-        self.options, self.seed = options, seed
-        self.device, self.kept = torch.device(device or "cpu"), kept
-        self._remember()
-
-    def _remember(self) -> None:
-        self._block = functools.lru_cache(maxsize=self.kept)(self._draw)
+        self.options, self.seed, self.device = options, seed, torch.device(device or "cpu")
+        self._blocks: dict[int, Scene] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs: scenes are drawn again."""
-        return {name: value for name, value in vars(self).items() if name != "_block"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Become what was copied."""
-        vars(self).update(state)
-        self._remember()
+        return {**vars(self), "_blocks": {}}  # a copy draws its scenes again
 
     def scenes(self, numbers: Tensor) -> Scene:
-        """Return the scenes with the given numbers, int64 [N]."""
-        parts = self._find(numbers)
-        found = [self._block(block)[0][rows] for block, rows, _ in parts]
-        if len(found) == 1:
-            return found[0]
-        order = torch.cat([places for _, _, places in parts])
-        return _cat(found)[order.argsort()]
+        """Return the scenes with the given numbers, int64 [N] from 0 on."""
+        every, places = self._holding(numbers)
+        return every[places]
 
-    def write(self, numbers: Tensor, leaves: list[Tensor], rows: Tensor) -> None:
+    def write(self, numbers: Tensor, into: list[Tensor], rows: Tensor) -> None:
         """Write the scenes with the given numbers, int64 [N], to rows of others, int64 [N].
-
-        That is ``others[rows] = self.scenes(numbers)``, in a third of the time.
 
         Args:
             numbers: which scenes.
-            leaves: what the others are made of, in the order of :func:`scene_leaves`.
+            into: :func:`leaves` of the others.
             rows: where, each once.
         """
-        parts = self._find(numbers)
-        for block, found, places in parts:
-            there = rows if len(parts) == 1 else rows[places]
-            for leaf, source in zip(leaves, self._block(block)[1], strict=True):
-                leaf.index_copy_(0, there, source.index_select(0, found))
+        every, places = self._holding(numbers)
+        for leaf, source in zip(into, leaves(every), strict=True):
+            leaf.index_copy_(0, rows, source.index_select(0, places))
 
-    def _find(self, numbers: Tensor) -> list[tuple[int, Tensor, Tensor]]:
-        """Return the blocks that hold given scenes, their rows there, and their places here."""
-        if not numbers.numel():
-            return [(0, numbers, numbers)]
-        low, high = (int(end) for end in numbers.aminmax())
-        if low < 0:
-            raise UserError("scene numbers start at 0")
-        everywhere = torch.arange(len(numbers), device=numbers.device)
-        if (first := low // BLOCK) == high // BLOCK:
-            return [(first, numbers - first * BLOCK, everywhere)]
+    def _holding(self, numbers: Tensor) -> tuple[Scene, Tensor]:
+        """Return blocks of scenes, one after the other, and the places of some scenes there."""
         blocks, which = (numbers // BLOCK).unique(return_inverse=True)
-        parts = []
-        for each, block in enumerate(blocks.tolist()):
-            places = (which == each).nonzero().squeeze(-1)
-            parts.append((block, numbers[places] - block * BLOCK, places))
-        return parts
+        parts: list[Any] = [self._block(block) for block in blocks.tolist() or [0]]
+        every: Any = parts[0] if len(parts) == 1 else torch.cat(parts)
+        return every, which * BLOCK + numbers % BLOCK
 
-    def _draw(self, block: int) -> tuple[Scene, list[Tensor]]:
-        """Return the scenes of a block, and what they are made of."""
-        scenes = draw_block(self.options, self.seed, block).to(self.device)
-        return scenes, scene_leaves(scenes)
-
-
-def _cat(scenes: list[Scene]) -> Scene:
-    return torch.cat(scenes)  # type: ignore[arg-type, return-value]
+    def _block(self, block: int) -> Scene:
+        if block not in self._blocks:
+            if len(self._blocks) == BLOCKS_KEPT:
+                del self._blocks[next(iter(self._blocks))]
+            self._blocks[block] = draw_block(self.options, self.seed, block).to(self.device)
+        return self._blocks[block]

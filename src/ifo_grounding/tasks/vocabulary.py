@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import unicodedata
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_below
 from ifo_grounding.keys import INSTRUCTION_LENGTH
 
 PAD = 0
 
 
+@dataclass(frozen=True)
 class Vocabulary:
     """Two-way table of words and token ids; id 0 pads.
 
@@ -21,26 +24,33 @@ class Vocabulary:
     vocabulary's own words keep punctuation that this takes away: such a vocabulary, of recordings
     that were made so, splits sentences at spaces only.
 
-    Args:
-        words: distinct lower-case words; the first gets id 1.
-        length: tokens per instruction, padding included.
-
     >>> vocabulary = Vocabulary(["move", "to", "the", "red", "circle"], length=6)
     >>> tokens = vocabulary.encode(["Move to the red circle!"])
     >>> tokens.tolist(), vocabulary.decode(tokens)
     ([[1, 2, 3, 4, 5, 0]], ['move to the red circle'])
     """
 
-    def __init__(self, words: Sequence[str], length: int = INSTRUCTION_LENGTH) -> None:
-        self.words = tuple(unicodedata.normalize("NFC", word) for word in words)
-        self.length = length
-        self.punctuation = any(words_of(word) != [word] for word in self.words)
-        """Whether words keep the punctuation around them."""
-        self._ids = {word: number for number, word in enumerate(self.words, start=1)}
-        if len(self._ids) != len(self.words):
+    words: Sequence[str]
+    """Distinct lower-case words; the first has id 1."""
+    length: int = INSTRUCTION_LENGTH
+    """Tokens per instruction, padding included."""
+
+    def __post_init__(self) -> None:
+        words = tuple(unicodedata.normalize("NFC", word) for word in self.words)
+        object.__setattr__(self, "words", words)
+        if len(self._ids) != len(words):
             raise UserError("a vocabulary must not hold a word twice")
-        if bad := [word for word in self.words if word.lower().split() != [word]]:
+        if bad := [word for word in words if word.lower().split() != [word]]:
             raise UserError(f"words must be lower case without spaces, got {bad[0]!r}")
+
+    @functools.cached_property
+    def _ids(self) -> dict[str, int]:
+        return {word: number for number, word in enumerate(self.words, start=1)}
+
+    @functools.cached_property
+    def punctuation(self) -> bool:
+        """Whether words keep the punctuation around them."""
+        return any(words_of(word) != [word] for word in self.words)
 
     @classmethod
     def from_sentences(
@@ -52,16 +62,6 @@ class Vocabulary:
     def __len__(self) -> int:
         """Count the token ids, padding included."""
         return len(self.words) + 1
-
-    def __eq__(self, other: object) -> bool:
-        """Compare words and length."""
-        if not isinstance(other, Vocabulary):
-            return NotImplemented
-        return self.words == other.words and self.length == other.length
-
-    def __hash__(self) -> int:
-        """Hash words and length."""
-        return hash((self.words, self.length))
 
     def encode(self, sentences: Sequence[str] | str, *, skip_unknown: bool = False) -> Tensor:
         """Turn sentences into token ids, int64 [N, length].
@@ -80,7 +80,12 @@ class Vocabulary:
             words = words_of(sentence, self.punctuation)
             if skip_unknown:
                 words = [word for word in words if word in self._ids]
-            ids = [self._id(word, sentence) for word in words]
+            if unknown := [word for word in words if word not in self._ids]:
+                raise UserError(
+                    f"unknown word {unknown[0]!r} in {sentence!r}: the vocabulary holds "
+                    + ", ".join(self.words)
+                )
+            ids = [self._ids[word] for word in words]
             if not 0 < len(ids) <= self.length:
                 raise UserError(
                     f"{sentence!r} has {len(ids)} words: an instruction has 1 to {self.length}"
@@ -95,23 +100,9 @@ class Vocabulary:
             UserError: for an id that is no word's.
         """
         table = ("", *self.words)
-        if tokens.numel():
-            low, high = (int(token) for token in tokens.aminmax())
-            if low < 0 or high >= len(table):
-                raise UserError(
-                    f"token {low if low < 0 else high} is no word: this vocabulary has ids "
-                    f"0..{len(table) - 1}"
-                )
+        check_below("the vocabulary has no token", tokens, len(table))
         rows = tokens.reshape(-1, tokens.shape[-1]).tolist()
         return [" ".join(table[token] for token in row if token != PAD) for row in rows]
-
-    def _id(self, word: str, sentence: str) -> int:
-        if word not in self._ids:
-            raise UserError(
-                f"unknown word {word!r} in {sentence!r}: the vocabulary holds "
-                + ", ".join(self.words)
-            )
-        return self._ids[word]
 
 
 def words_of(sentence: str, punctuation: bool = False) -> list[str]:

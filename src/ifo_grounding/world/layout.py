@@ -24,12 +24,11 @@ class Layout:
     boxes: tuple[int, int] = (2, 4)
     """Fewest and most boxes; their colours differ."""
     inside: float = 0.35
-    """Probability that an object starts inside a box, as long as boxes are free."""
+    """Probability that an object starts inside a box, while boxes are free: each holds one."""
     excluded_kinds: tuple[int, ...] = ()
     """Object kinds that no scene shows."""
 
     def __post_init__(self) -> None:
-        """Refuse layouts that no grid can hold."""
         if not 3 <= whole("size", self.size) <= 16:
             raise UserError(f"size must be 3..16 cells, got {self.size}")
         for name, counts, most in (
@@ -58,8 +57,6 @@ def random_layout(
 ) -> WorldState:
     """Draw initial states: objects and boxes in distinct places, the arm anywhere, nothing held.
 
-    An object is put inside a box with probability ``layout.inside``, at most one in each box.
-
     >>> state = random_layout(3, generator=torch.Generator().manual_seed(0))
     >>> state.held.tolist()
     [0, 0, 0]
@@ -68,40 +65,30 @@ def random_layout(
     cells = layout.size**2
     most_objects, most_boxes = layout.objects[1], layout.boxes[1]
 
-    def rand(*shape: int) -> Tensor:
-        return draw_rows(
-            lambda rows, source: torch.rand(
-                rows, *shape, generator=source, device=device, dtype=torch.float32
-            ),
-            batch,
-            generator,
-        )
+    def rand(width: int) -> Tensor:
+        return draw_rows(torch.rand, (batch, width), generator, device=device, dtype=torch.float32)
 
     def count(low: int, high: int) -> Tensor:
         return low + (rand(1) * (high - low + 1)).long()
 
     places = highest(rand(cells), most_boxes + most_objects)
-    box_cells, free_cells = places.split([most_boxes, most_objects], dim=-1)
 
     colours = 1 + rand(N_BOXES).argsort(-1)[:, :most_boxes]
     n_boxes = count(*layout.boxes)
     box_exists = torch.arange(most_boxes, device=device) < n_boxes
     boxes = torch.zeros(batch, cells, dtype=torch.uint8, device=device)
-    boxes.scatter_(-1, box_cells, (colours * box_exists).to(torch.uint8))
+    boxes.scatter_(-1, places[:, :most_boxes], (colours * box_exists).to(torch.uint8))
 
     allowed = [k for k in range(1, N_KINDS + 1) if k not in layout.excluded_kinds]
     table = torch.tensor(allowed, device=device)
     kinds = table[(rand(most_objects) * len(allowed)).long()]
-    kinds = kinds * (torch.arange(most_objects, device=device) < count(*layout.objects))
+    number = torch.arange(most_objects, device=device)
+    kinds = kinds * (number < count(*layout.objects))
 
     wants_box = (rand(most_objects) < layout.inside) & (kinds > 0)
     rank = wants_box.long().cumsum(-1) - 1
     in_box = wants_box & (rank < n_boxes)
-    if most_boxes:
-        boxed_cell = box_cells.gather(-1, rank.clamp(0, most_boxes - 1))
-        cell = torch.where(in_box, boxed_cell, free_cells)
-    else:
-        cell = free_cells
+    cell = places.gather(-1, torch.where(in_box, rank, most_boxes + number))
     # Cells are distinct, so that adding writes each kind once and nothing where there is none.
     objects = torch.zeros(batch, cells, dtype=torch.uint8, device=device)
     objects.scatter_add_(-1, cell, kinds.to(torch.uint8))
@@ -112,15 +99,11 @@ def random_layout(
 
 
 def highest(lots: Tensor, k: int) -> Tensor:
-    """Return where the highest of each row of lots lie, the highest first, int64 [N, k].
+    """Return ``lots.topk(k).indices``, int64 [N, k], on a CPU in a quarter of the time.
 
-    That is ``lots.topk(k).indices``, on a CPU in a quarter of the time.
-
-    Args:
-        lots: multiples of 2^-24 in [0, 1), as ``torch.rand`` draws them, float32 [N, C].
-        k: how many.
+    Lots are multiples of 2^-24 in [0, 1), as ``torch.rand`` draws them, float32 [N, C].
     """
-    if lots.device.type != "cpu" or not k:
+    if lots.device.type != "cpu":
         return lots.topk(k).indices
     # Each place is written behind its lot, of 24 bits, for NumPy sorts whole numbers fastest.
     bits = lots.shape[-1].bit_length()
