@@ -79,10 +79,6 @@ class SupervisedLoss(LossModule):
         """Every key that :meth:`forward` reads: the network's, and those of ``set_keys``."""
         return list(dict.fromkeys([*self.own_keys, *vars(self.tensor_keys).values()]))
 
-    @in_keys.setter
-    def in_keys(self, values: object) -> None:
-        raise UserError("in_keys follow from the network and set_keys: use set_keys")
-
     def _require(self, tensordict: TensorDictBase) -> None:
         """Raise :class:`UserError` where a key is missing, for ``get`` would return None."""
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
@@ -106,9 +102,6 @@ class SupervisedLoss(LossModule):
     def _mean(self, values: Tensor, tensordict: TensorDictBase | None = None) -> Tensor:
         """Return the mean of a metric over the samples that a mask of TorchRL leaves."""
         return self._reduce_loss(values.detach().float(), tensordict)
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """No value estimator: nothing to forward."""
 
 
 def flat(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:

@@ -50,7 +50,7 @@ class Loop:
         with tqdm(total=end, initial=first, desc=self.name, disable=off, leave=False) as bar:
             for iteration in range(first, end):
                 yield iteration
-                bar.set_postfix(_brief(self.history[-1]), refresh=False)
+                bar.set_postfix(_shown(self.history[-1]), refresh=False)
                 bar.update()
 
     def add(self, metrics: Metrics, step: int) -> None:
@@ -75,8 +75,7 @@ class Loop:
             self._last_save = time.monotonic()
 
 
-def _brief(metrics: Metrics) -> dict[str, str]:
+def _shown(metrics: Metrics) -> dict[str, str]:
     """Return the metrics that a progress bar shows."""
-    told = ("loss", "accuracy", "success", "learned_return")
-    shown = [key for key in metrics if key.startswith(told)]
-    return {key.removeprefix("loss_"): f"{metrics[key]:.3f}" for key in shown[:3]}
+    shown = [key for key in metrics if key.startswith(("loss", "accuracy", "learned_return"))]
+    return {key: f"{metrics[key]:.3f}" for key in shown[:3]}
