@@ -182,17 +182,11 @@ class NegativeInstructions(nn.Module):
 def pair_scores(
     network: TensorDictModule, batch: TensorDictBase, others: Tensor, output: NestedKey
 ) -> tuple[Tensor, Tensor]:
-    """Score each row's own instruction and others: logits [N] and [N, K].
+    """Score each row's own instruction and others, token ids [N, K, L]: logits [N] and [N, K].
 
     A network with ``encode_scenes``, ``encode_instruction`` and ``score_candidates`` encodes each
     row's images and each distinct instruction once; any other runs once per pair. On a GPU, where
     finding the distinct ones would wait for it, all are encoded unless scenes are shared.
-
-    Args:
-        network: images and an instruction, its last input, to a logit [*B, 1].
-        batch: its inputs, batch size [N].
-        others: token ids [N, K, L].
-        output: where the network writes.
     """
     *pixel_keys, instruction_key = network.in_keys
     both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
@@ -216,9 +210,5 @@ def pair_scores(
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the mean of ``values`` where ``mask``, 0 where nowhere.
-
-    >>> float(masked_mean(torch.tensor([1.0, 3.0]), torch.tensor([False, True])))
-    3.0
-    """
+    """Return the mean of ``values`` where ``mask``, 0 where nowhere."""
     return torch.where(mask, values, 0).sum() / mask.sum().clamp_min(1)

@@ -34,7 +34,6 @@ class AuxiliaryImitation:
     """Labelled steps per gradient step."""
 
     def __post_init__(self) -> None:
-        """Refuse weights and batches that cannot be."""
         check_range(self, "weight", above=0)
         check_range(self, "batch_size", least=1)
 

@@ -18,13 +18,7 @@ Log = Callable[[Metrics, int], None]
 class Loop:
     """Iterations of a training loop, which go on from a checkpoint and end in one.
 
-    Args:
-        name: of the progress bar, and in errors.
-        iterations: how many there are, or after how many to pause.
-        saved: checkpoint to go on from and to save to, if any.
-        seconds: least time between two checkpoints.
-        log: gets the metrics of each iteration and the step.
-        progress: whether to show a progress bar.
+    There are ``iterations``, also if some are done. At least ``seconds`` pass between two saves.
     """
 
     def __init__(

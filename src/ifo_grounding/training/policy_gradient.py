@@ -90,10 +90,6 @@ class Learner:
                 updates.append(update(losses, self.optimizer, config.grad_clip))
         return means(updates)
 
-    def close(self) -> None:
-        """Let go of the collector, and leave the env open for its owner."""
-        self.collector.shutdown(close_env=False)
-
 
 def _make_loss(
     policy: ProbabilisticTensorDictSequential,

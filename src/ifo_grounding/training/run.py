@@ -107,15 +107,13 @@ class Run:
         if not path.exists():
             return None
         from omegaconf import OmegaConf
-        from omegaconf.errors import OmegaConfBaseException
-        from yaml import YAMLError
 
         try:
             options = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
             if isinstance(options, dict):
                 return {str(name): value for name, value in options.items()}
             why = "it holds no options"
-        except (OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
+        except Exception as error:  # of YAML, of OmegaConf, of the file
             why = str(error).splitlines()[0]
         raise UserError(f"{path} is damaged ({why}): restore it, or give another run=")
 

@@ -24,6 +24,8 @@ from ifo_grounding.training.loop import Metrics
 from ifo_grounding.training.reseeding import reseed, sampler_stats, stored_starts
 from ifo_grounding.training.updates import total_loss
 
+CLEARLY = 2.0
+
 
 class BestWeights:
     """The weights of a module that did best so far, by whatever a subclass measures."""
@@ -110,8 +112,6 @@ class HeldOutAccuracy:
     Args:
         policy: acts greedily.
         buffer: held-out transitions, as :func:`~ifo_grounding.data.labelled_buffer` makes them.
-        margin: standard errors of the paired difference, over demonstrations, by which the
-            accuracy has to fall to be clearly worse.
         batch_size: transitions that pass the policy together.
 
     Raises:
@@ -126,15 +126,10 @@ class HeldOutAccuracy:
     """
 
     def __init__(
-        self,
-        policy: TensorDictModuleBase,
-        buffer: ReplayBuffer,
-        margin: float = 2.0,
-        batch_size: int = 1024,
+        self, policy: TensorDictModuleBase, buffer: ReplayBuffer, batch_size: int = 1024
     ) -> None:
         _check_held_out(buffer)
-        self.policy, self.buffer = policy, buffer
-        self.margin, self.batch_size = margin, batch_size
+        self.policy, self.buffer, self.batch_size = policy, buffer, batch_size
         self.first: Tensor | None = None
 
     def measure(self) -> Tensor:
@@ -153,12 +148,15 @@ class HeldOutAccuracy:
         return total[0] / total[1]
 
     def compare(self) -> tuple[float, bool]:
-        """Return the mean accuracy, and whether it is clearly below that of the first call."""
+        """Return the mean accuracy, and whether it is clearly below that of the first call.
+
+        That is by more than ``CLEARLY`` standard errors of the paired difference.
+        """
         accuracy = self.measure()
         if self.first is None:
             self.first = accuracy
         change = accuracy - self.first
-        return float(accuracy.mean()), float(change.mean()) < -self.margin * _error(change)
+        return float(accuracy.mean()), float(change.mean()) < -CLEARLY * _error(change)
 
 
 class BestCheckpoint(BestWeights):

@@ -76,7 +76,6 @@ class SelfExaminationConfig:
     """Iterations between two calls of the callback; 0 calls it at the end only."""
 
     def __post_init__(self) -> None:
-        """Refuse unknown algorithms and values out of range."""
         check_numbers(self, unbounded=["grad_clip", "select_margin"])
         check_choice("algorithm", self.algorithm, ALGORITHMS)
         check_range(self, "iterations", "steps", "epochs", "minibatch", least=1)
@@ -180,7 +179,7 @@ def self_examine(
         if callback and (last or (config.evaluate_every and done % config.evaluate_every == 0)):
             metrics |= {name: float(number) for name, number in callback(done).items()}
         loop.add(metrics, done)
-    learner.close()
+    learner.collector.shutdown(close_env=False)  # the env is its owner's
     return loop.history
 
 

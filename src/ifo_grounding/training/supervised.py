@@ -62,7 +62,6 @@ class FitConfig:
     """Iterations between two measures of ``held_out``, where there is one."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown schedule and values out of range."""
         check_numbers(self, unbounded=["grad_clip"])
         check_choice("schedule", self.schedule, SCHEDULES)
         check_range(self, "steps", "batch_size", "iteration", "validate_every", least=1)

@@ -70,9 +70,8 @@ class CapturedUpdate:
     computes them. ``tensordict.nn.CudaGraphModule`` synchronises with the GPU at every call.
 
     Args:
-        update: maps a batch to metrics. It launches the same kernels whatever the batch holds,
-            reads no tensor back to the CPU, and steps an optimizer prepared by
-            :func:`let_capture`.
+        update: maps a batch to metrics, by the same kernels whatever the batch holds, reads nothing
+            back to the CPU, and steps an optimizer prepared by :func:`let_capture`.
 
     Raises:
         UserError: where the update cannot be captured.
