@@ -15,11 +15,12 @@ from ifo_grounding.training import (
     HeldOutAccuracy,
     self_examine,
 )
-from training.test_held_out_accuracy import labelled
 from training.tiny import (
     POOL,
     TEACH,
     config,
+    kill_at,
+    labelled,
     likes,
     make_env,
     make_networks,
@@ -36,25 +37,16 @@ def reward_loss(seed=0):
 
 def test_auxiliary_imitation_keeps_what_the_demonstrations_show():
     """Demonstrations that always take action 3 hold against a reward model that likes action 1."""
-    demos = TensorDictReplayBuffer(storage=LazyTensorStorage(64))
-    frames = simulator(64).reset()[keys.PIXELS]
-    words = POOL[torch.arange(64) % len(POOL)]
-    shown = {keys.PIXELS: frames, keys.INSTRUCTION: words, keys.ACTION: torch.full((64,), 3)}
-    demos.extend(TensorDict(shown, [64]))
-    shares = {}
+    demos, shares = TensorDictReplayBuffer(storage=LazyTensorStorage(12)), {}
+    shown = {keys.PIXELS: simulator(12).reset()[keys.PIXELS], keys.INSTRUCTION: POOL}
+    demos.extend(TensorDict({**shown, keys.ACTION: torch.full((12,), 3)}, [12]))
     for weight in (0.0, 10.0):
         policy, value = make_networks()
         imitation = AuxiliaryImitation(ImitationLoss(policy), demos, weight, 32) if weight else None
-        history = self_examine(
-            make_env(),
-            policy,
-            value,
-            config(iterations=6, **TEACH),
-            seed=0,
-            imitation=imitation,
-        )
+        taught = config(iterations=6, **TEACH)
+        history = self_examine(make_env(), policy, value, taught, seed=0, imitation=imitation)
         assert ("loss_imitation" in history[-1]) == bool(weight)
-        action = policy(TensorDict(shown, [64]))[keys.ACTION]
+        action = policy(TensorDict(shown, [12]))[keys.ACTION]
         shares[weight] = float((action == 3).float().mean())
     assert shares[0.0] < 0.3 and shares[10.0] > 0.8
     with pytest.raises(UserError, match="weight must be above 0"):
@@ -80,17 +72,14 @@ def test_adversarial_updates_go_on_from_a_checkpoint(tmp_path):
     chosen = config(iterations=2)
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
 
-    def interrupt(metrics, step):
-        if step == 2:
-            raise KeyboardInterrupt
+    def examine(updates, **options):
+        self_examine(make_env(), *make_networks(), chosen, adversarial=updates, **options)
 
-    whole, parts, resumed = adversarial(), adversarial(), adversarial(seed=1)
-    self_examine(make_env(), *make_networks(), chosen, seed=0, adversarial=whole)
+    whole, resumed = adversarial(), adversarial(seed=1)
+    examine(whole, seed=0)
     with pytest.raises(KeyboardInterrupt):
-        self_examine(
-            make_env(), *make_networks(), chosen, adversarial=parts, log=interrupt, **options
-        )
-    self_examine(make_env(), *make_networks(), chosen, adversarial=resumed, **options)
+        examine(adversarial(), log=kill_at(2), **options)
+    examine(resumed, **options)
     assert same(weights(resumed.loss), weights(whole.loss))
 
 
@@ -109,8 +98,5 @@ def test_with_adversarial_updates_the_most_accurate_policy_is_kept():
     assert same(weights(policy), before)
     with pytest.raises(UserError, match="give held_out="):
         self_examine(make_env(likes(1)), policy, value, misled, **options)
-
-
-def test_to_choose_by_accuracy_takes_demonstrations():
     with pytest.raises(UserError, match="give held_out="):
-        BestCheckpoint(make_env(), make_networks()[0], seed=0, by_accuracy=True)
+        BestCheckpoint(make_env(), policy, seed=0, by_accuracy=True)

@@ -14,7 +14,7 @@ from ifo_grounding.objectives import ImitationLoss, InstructionLoss
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.training.updates import total_loss
 from training import tiny
-from training.tiny import same, weights
+from training.tiny import kill_at, same, weights
 
 SHAPES = Shapes(image_shape=(3, 16, 16), vocabulary_size=10, tile_size=8)
 
@@ -59,40 +59,24 @@ def test_fit_is_a_function_of_its_seed(buffer):
 
 
 def test_a_run_goes_on_within_a_round_of_all_samples(buffer, tmp_path):
-    data = buffer.storage.get(slice(0, 256))
+    def learned(**options):
+        loss, sampler = imitation(), SamplerWithoutReplacement()
+        stored = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=sampler)
+        stored.extend(buffer[:256])
+        fit(loss, stored, FitConfig(steps=12, batch_size=32, iteration=3), seed=0, **options)
+        return weights(loss)
 
-    def parts():
-        stored = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(256), sampler=SamplerWithoutReplacement()
-        )
-        stored.extend(data)
-        return imitation(), stored
-
-    config = FitConfig(steps=12, batch_size=32, iteration=3)
-    whole, stored = parts()
-    fit(whole, stored, config, seed=0)
-    options = {"seed": 0, "checkpoint": tmp_path / "fit.pt"}
-    fit(*parts(), config, **options, until=6)
-    resumed, stored = parts()
-    fit(resumed, stored, config, **options)
-    assert same(weights(resumed), weights(whole))
+    learned(checkpoint=tmp_path / "fit.pt", until=6)
+    assert same(learned(checkpoint=tmp_path / "fit.pt"), learned())
 
 
 def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path):
     config = FitConfig(steps=12, batch_size=32, iteration=3)
     whole = imitation(0.25)
     expected = fit(whole, buffer, config, seed=0)
-
-    class Killed(BaseException):
-        pass
-
-    def kill(metrics, step):
-        if step == 9:
-            raise Killed
-
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
-    with pytest.raises(Killed):
-        fit(imitation(0.25), buffer, config, log=kill, **options)
+    with pytest.raises(KeyboardInterrupt):
+        fit(imitation(0.25), buffer, config, log=kill_at(9), **options)
     resumed, steps = imitation(0.25), []
     history = fit(resumed, buffer, config, log=lambda _, step: steps.append(step), **options)
     assert steps == [9, 12]  # the iteration that was cut is done again
@@ -114,17 +98,11 @@ def test_the_schedule_warms_up_and_ends_near_zero():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"steps": 0},
-        {"batch_size": -1},
-        {"schedule": "linear"},
-        {"prior": -1},
-        {"grad_clip": 0},
-        {"grad_clip": -1.0},
-        {"warmup": 5.0},
-        {"warmup": -0.1},
-        {"validate_every": 0},
+        *({"steps": 0}, {"batch_size": -1}, {"schedule": "linear"}, {"prior": -1}),
+        *({"grad_clip": 0}, {"warmup": 5.0}, {"warmup": -0.1}, {"validate_every": 0}),
         {"weight_decay": math.inf},
     ],
+    ids=str,
 )
 def test_impossible_configs_are_refused(wrong):
     with pytest.raises(UserError):
