@@ -43,7 +43,7 @@ def test_auxiliary_imitation_keeps_what_the_demonstrations_show():
     for weight in (0.0, 10.0):
         policy, value = make_networks()
         imitation = AuxiliaryImitation(ImitationLoss(policy), demos, weight, 32) if weight else None
-        taught = config(iterations=6, **TEACH)
+        taught = config(iterations=3, **TEACH)
         history = self_examine(make_env(), policy, value, taught, seed=0, imitation=imitation)
         assert ("loss_imitation" in history[-1]) == bool(weight)
         action = policy(TensorDict(shown, [12]))[keys.ACTION]

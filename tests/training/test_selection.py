@@ -143,7 +143,7 @@ def test_a_policy_that_a_misleading_reward_has_changed_is_not_kept(held_out):
     prefer(policy, 2)
     before = weights(policy)
     accuracy = HeldOutAccuracy(policy, labelled(2)) if held_out else None
-    misled = config(iterations=8, select_every=4, select_episodes=32, max_steps=5, **TEACH)
+    misled = config(iterations=4, select_every=2, select_episodes=16, max_steps=3, **TEACH)
     history = self_examine(make_env(likes(1)), policy, value, misled, seed=0, held_out=accuracy)
     measured = [metrics for metrics in history if "selected" in metrics]
     assert measured[-1]["selection_return"] > 2
@@ -227,17 +227,17 @@ def test_stored_pairs_are_measured_from_the_same_first_starts():
     env = TransformedEnv(simulator(8), Compose(starts, paid))
     policy, value = make_networks()
     other = TransformedEnv(simulator(8), Compose(copy.deepcopy(starts), copy.deepcopy(paid)))
-    first = BestCheckpoint(other, policy, seed=0, episodes=16, max_steps=4).measure()
-    frozen = config(iterations=4, value_warmup=3, select_every=1, select_episodes=16, max_steps=4)
+    first = BestCheckpoint(other, policy, seed=0, episodes=16, max_steps=3).measure()
+    frozen = config(iterations=3, value_warmup=2, select_every=1, select_episodes=16, max_steps=3)
     history = self_examine(env, policy, value, frozen, seed=0)
-    returns = {metrics["selection_return"] for metrics in history[:3]}
+    returns = {metrics["selection_return"] for metrics in history[:2]}
     assert returns == {first["selection_return"]}
 
 
 def test_measuring_leaves_the_training_as_it_is():
     runs = []
     for every in (0, 1):
-        chosen = config(iterations=3, select_every=every, select_episodes=16, max_steps=4)
+        chosen = config(select_every=every, select_episodes=16, max_steps=2)
         history = self_examine(make_env(), *make_networks(), chosen, seed=0)
         runs.append([metrics["learned_reward"] for metrics in history])
     assert runs[0] == runs[1]

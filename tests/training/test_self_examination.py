@@ -57,7 +57,7 @@ def of_pairs():
 @pytest.mark.parametrize("algorithm", ["ppo", "reinforce"])
 def test_a_policy_learns_what_the_reward_model_likes(algorithm):
     """One action's share rises from about a sixth; the true reward is 0."""
-    chosen = config(algorithm=algorithm, iterations=8, **TEACH)
+    chosen = config(algorithm=algorithm, iterations=3, **TEACH)
     history = self_examine(make_env(likes(1), 32), *make_networks(), chosen, seed=0)
     assert history[0]["learned_reward"] < 0.35
     assert history[-1]["learned_reward"] > 0.6
@@ -91,17 +91,17 @@ def test_the_callback_runs_when_due_and_at_the_end():
     history = self_examine(
         make_env(),
         *make_networks(),
-        config(iterations=5, evaluate_every=2),
+        config(iterations=3, evaluate_every=2),
         seed=0,
         callback=lambda done: called.append(done) or {"success": torch.tensor(0.5)},
     )
-    assert called == [2, 4, 5]
-    assert [metrics.get("success") for metrics in history] == [None, 0.5, None, 0.5, 0.5]
+    assert called == [2, 3]
+    assert [metrics.get("success") for metrics in history] == [None, 0.5, 0.5]
 
 
 def test_values_are_estimated_some_at_a_time_with_the_same_result(monkeypatch):
     learned = []
-    for steps in (40, 10_000):  # five worlds, all sixteen
+    for steps in (20, 10_000):  # five worlds, all sixteen
         monkeypatch.setattr("ifo_grounding.training.policy_gradient.AT_ONCE", steps)
         networks = make_networks()
         self_examine(make_env(), *networks, config(gamma=0.9), seed=0)
@@ -111,7 +111,7 @@ def test_values_are_estimated_some_at_a_time_with_the_same_result(monkeypatch):
 
 @pytest.mark.parametrize("make", [nested, grouped])
 def test_a_killed_run_continues_to_the_same_weights(tmp_path, make):
-    chosen = config(iterations=3, select_every=1, select_episodes=8, max_steps=4)
+    chosen = config(iterations=3, select_every=1, select_episodes=8, max_steps=2)
     whole = make_networks()
     expected = self_examine(make(), *whole, chosen, seed=0)
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
@@ -127,13 +127,13 @@ def test_a_killed_run_continues_to_the_same_weights(tmp_path, make):
 
 def test_an_interrupted_run_goes_on_with_the_same_objects(tmp_path):
     """As in a notebook: policy and environment are then no longer as they were at first."""
-    chosen = config(iterations=4, select_every=1, select_episodes=8, max_steps=4)
+    chosen = config(iterations=3, select_every=1, select_episodes=8, max_steps=2)
     whole = make_networks()
     expected = self_examine(of_pairs(), *whole, chosen, seed=0)
     env, networks = of_pairs(), make_networks()
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
     with pytest.raises(KeyboardInterrupt):
-        self_examine(env, *networks, chosen, log=kill_at(3), **options)
+        self_examine(env, *networks, chosen, log=kill_at(2), **options)
     assert self_examine(env, *networks, chosen, **options) == expected
     assert same(weights(*networks), weights(*whole))
 
@@ -143,9 +143,9 @@ def test_worlds_may_live_in_workers():
     sampled = Compose(InstructionSampler(accepts_all(), POOL), LearnedReward(likes(1)))
     env = TransformedEnv(ParallelEnv(2, lambda: simulator(4), mp_start_method="fork"), sampled)
     with contextlib.closing(env):
-        chosen = config(select_every=1, select_episodes=12, max_steps=5)
+        chosen = config(select_every=1, select_episodes=12, max_steps=3)
         history = self_examine(env, *make_networks(), chosen, seed=0)
-    assert history[-1]["frames"] == 2 * 4 * 8
+    assert history[-1]["frames"] == 2 * 4 * 4
     assert history[-1]["selection_return"] > 0
 
 

@@ -41,9 +41,9 @@ def imitation(dropout=0.0):
 def test_fit_learns_and_reports_each_iteration(buffer):
     loss = imitation()
     seen = []
-    config = FitConfig(steps=120, batch_size=64, lr=5e-2, iteration=40)
+    config = FitConfig(steps=60, batch_size=64, lr=1e-1, iteration=20)
     history = fit(loss, buffer, config, seed=0, log=lambda metrics, step: seen.append(step))
-    assert [metrics["step"] for metrics in history] == [40, 80, 120] == seen
+    assert [metrics["step"] for metrics in history] == [20, 40, 60] == seen
     assert history[-1]["loss_imitation"] < 0.1 < history[0]["loss_imitation"]
     assert history[-1]["accuracy"] == 1.0
     assert history[-1]["samples_per_second"] > 0
@@ -121,7 +121,7 @@ def test_the_prior_counts_for_the_more_the_fewer_the_samples(buffer):
         loss = imitation()
         few = TensorDictReplayBuffer(storage=LazyTensorStorage(samples))
         few.extend(buffer[:samples])
-        fit(loss, few, FitConfig(steps=40, batch_size=32, lr=5e-3, prior=prior), seed=0)
+        fit(loss, few, FitConfig(steps=20, batch_size=32, lr=1e-2, prior=prior), seed=0)
         return sum(weight.square().sum().item() for weight in loss.parameters())
 
     assert size_of_weights(16, prior=200) < size_of_weights(256, prior=200)
@@ -136,9 +136,9 @@ def test_what_was_inherited_decays_to_what_it_was(buffer, tmp_path):
     with torch.no_grad():
         for weight in policy.parameters():
             weight.add_(0.5)  # far from zero
-    config = FitConfig(steps=40, batch_size=32, lr=1e-3, schedule="constant", prior=256 * 100)
+    config = FitConfig(steps=20, batch_size=16, lr=1e-3, schedule="constant", prior=256 * 100)
     loss, begun = suitability(policy), suitability(policy)
-    for until in (20, None):
+    for until in (10, None):
         fit(loss, buffer, config, seed=0, checkpoint=tmp_path / "fit.pt", until=until)
     origins = inherited(loss)
     assert len(origins) > 10

@@ -94,7 +94,7 @@ def make_env(reward_model=None, num_envs=16):
 
 
 def config(**kwargs):
-    chosen = {"iterations": 2, "steps": 8, "minibatch": 64, "value_warmup": 0, "epochs": 1}
+    chosen = {"iterations": 2, "steps": 4, "minibatch": 32, "value_warmup": 0, "epochs": 1}
     return SelfExaminationConfig(**{**chosen, **kwargs})
 
 
@@ -119,5 +119,5 @@ def kill_at(last):
     return log
 
 
-TEACH = {"gamma": 0.0, "lr": 3e-2, "entropy": 0.0, "epochs": 3}
+TEACH = {"gamma": 0.0, "lr": 1e-1, "entropy": 0.0, "epochs": 3}
 """Options with which the tiny policy learns an action within a few iterations."""
