@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 
@@ -109,13 +108,6 @@ def test_impossible_configs_are_refused(wrong):
         FitConfig(**wrong)
 
 
-def test_the_config_is_a_schema():
-    given = OmegaConf.merge(OmegaConf.structured(FitConfig), {"steps": 7, "lr": 1})
-    assert OmegaConf.to_object(given) == FitConfig(steps=7, lr=1.0)
-    with pytest.raises(UserError, match="unknown schedule 'linear'"):
-        OmegaConf.to_object(OmegaConf.merge(given, {"schedule": "linear"}))
-
-
 def test_the_prior_counts_for_the_more_the_fewer_the_samples(buffer):
     def size_of_weights(samples, prior):
         loss = imitation()
@@ -166,9 +158,7 @@ def test_what_cannot_be_sampled_is_refused():
 
 
 def test_numbers_of_numpy_do_not_break_a_checkpoint(buffer, tmp_path):
-    config = FitConfig(
-        steps=np.int64(4), batch_size=8, iteration=2, lr=np.logspace(-3, -2, 2)[0], weight_decay=0
-    )
+    config = FitConfig(steps=np.int64(4), batch_size=8, iteration=2, lr=np.logspace(-3, -2, 2)[0])
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt"}
     fit(imitation(), buffer, config, until=2, **options)
     assert len(fit(imitation(), buffer, config, **options)) == 2
