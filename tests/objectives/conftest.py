@@ -64,5 +64,11 @@ def batch(size=(12,), seed: int = 0) -> TensorDict:
     )
 
 
+def seeded(loss, *args, **kwargs):
+    """Call a loss with the random numbers of one seed."""
+    torch.manual_seed(0)
+    return loss(*args, **kwargs)
+
+
 def total(losses: TensorDict) -> torch.Tensor:
     return sum(value for key, value in losses.items() if key.startswith("loss_"))

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.objectives import InstructionLoss, NegativeInstructions, RewardLoss, pairs
-from objectives.conftest import LOSSES, POOL, SHAPES
+from ifo_grounding.objectives import NegativeInstructions, pairs
+from objectives.conftest import POOL, batch, make_loss
 
 
 def chi_squared(counts: torch.Tensor) -> float:
@@ -12,19 +12,15 @@ def chi_squared(counts: torch.Tensor) -> float:
 
 
 def test_negatives_are_uniform_among_all_others():
-    negatives = NegativeInstructions(POOL, 0.0, generator=torch.Generator().manual_seed(0))
-    own = POOL[4].expand(1000, -1)
-    drawn = negatives.draw(own, 20)
+    negatives = NegativeInstructions(POOL, 0.0)
+    drawn = negatives.draw(POOL[4].expand(1000, -1), 20)
     assert drawn.shape == (1000, 20, 4)
     counts = torch.bincount(drawn[..., 0].flatten(), minlength=13)[1:]
     assert counts[4] == 0
     others = counts[counts > 0]
     assert len(others) == 11
     assert chi_squared(others) < 35.6  # 10 degrees of freedom, p = 1e-4
-
-
-def test_negatives_of_an_instruction_outside_the_pool_are_uniform_among_all():
-    negatives = NegativeInstructions(POOL, 0.0, generator=torch.Generator().manual_seed(0))
+    # Those of an instruction outside the pool are uniform among all.
     drawn = negatives.draw(torch.full((1000, 4), 13), 20)
     counts = torch.bincount(drawn[..., 0].flatten(), minlength=13)[1:]
     assert chi_squared(counts) < 37.4  # 11 degrees of freedom, p = 1e-4
@@ -34,14 +30,6 @@ def test_repeated_rows_of_a_pool_are_never_drawn_against_themselves():
     pool = POOL[[0, 0, 0, 1]]
     negatives = NegativeInstructions(pool, 0.0)
     assert negatives.draw(pool, 50)[:3, :, 0].unique().tolist() == [2]
-
-
-def test_a_generator_repeats_the_draws():
-    def draws():
-        source = torch.Generator().manual_seed(5)
-        return NegativeInstructions(POOL, 0.0, generator=source).draw(POOL, 3)
-
-    assert torch.equal(draws(), draws())
 
 
 @pytest.mark.parametrize(("rate", "count", "dropped"), [(0.0, 10, 0), (0.3, 10, 3), (0.3, 3, 0)])
@@ -91,17 +79,23 @@ def test_the_nearest_are_found_once_for_each_instruction(monkeypatch):
         (POOL, {"contrast": -1.0}, "contrast"),
         (POOL, {"near": 1.0}, "near"),
         (POOL, {"unlabelled": "ignored"}, "treatment of unlabelled"),
+        (POOL, {"states": torch.zeros(3, 24, 24)}, r"states must be images \[S, C, H, W\]"),
+        (POOL, {"states": torch.zeros(0, 3, 24, 24)}, "states must be images"),
+        (POOL, {"fresh": 0}, "fresh must be at least 1, got 0"),
+        (None, {}, r"such as demos.pool\(\), got NoneType"),
     ],
 )
 def test_impossible_negatives_are_refused(pool, options, message):
-    make, _, _ = LOSSES["instruction"]
     with pytest.raises(UserError, match=message):
-        InstructionLoss(make(SHAPES), pool, **options)
+        make_loss("instruction", pool=pool, **options)
 
 
 def test_random_actions_are_uniform_among_the_others():
-    make, _, _ = LOSSES["reward"]
-    loss = RewardLoss(make(SHAPES), generator=torch.Generator().manual_seed(0))
-    counts = torch.bincount(loss._different(torch.full((10_000,), 4)), minlength=6)
+    loss = make_loss("reward", "paper")
+    seen = []
+    loss.network.all_actions = lambda pixels, _: torch.arange(6.0).expand(1000, 10, 6)
+    loss._losses = lambda right, wrong, *_: seen.append(wrong)
+    loss(batch((10,)).expand(1000, 10).set("action", torch.full((1000, 10), 4)))
+    counts = torch.bincount(seen[0].flatten().long(), minlength=6)
     assert counts[4] == 0
     assert chi_squared(counts[counts > 0]) < 23.6  # 4 degrees of freedom, p = 1e-4

@@ -46,7 +46,7 @@ def prepared(tmp_path):
 
 def last_saved(run) -> int:
     """Return when a checkpoint of the imitation was written last, 0 where none was."""
-    found = (run / "checkpoints").glob("imitate*.pt")
+    found = (run / "checkpoints").glob("imitate/*.pt")
     return max((path.stat().st_mtime_ns for path in found), default=0)
 
 

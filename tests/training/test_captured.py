@@ -8,11 +8,7 @@ from tensordict import TensorDict
 
 from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import (
-    make_instruction_classifier,
-    make_policy,
-    make_reward_model,
-)
+from ifo_grounding.networks import make_instruction_classifier, make_policy, make_reward_model
 from ifo_grounding.objectives import ImitationLoss, InstructionLoss, RewardLoss
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.training.updates import (
@@ -125,15 +121,8 @@ def test_a_captured_step_learns_what_single_kernels_learn(make, kind, tolerance,
             loss = kind(make(demos, "paper", **options))
             buffer = labelled_buffer(demos, truth.actions)
             buffer.transform.to("cuda")
-            history = fit(
-                loss,
-                buffer,
-                config,
-                seed=0,
-                cudagraph=cudagraph,
-                checkpoint=tmp_path / f"{cudagraph}.pt",
-                until=until,
-            )
+            how = {"cudagraph": cudagraph, "checkpoint": tmp_path / f"{cudagraph}.pt"}
+            history = fit(loss, buffer, config, seed=0, until=until, **how)
         found[cudagraph] = torch.tensor([list(row.values())[1] for row in history])
     assert (found[True] - found[False]).abs().max() < tolerance, found
     assert found[True][-1] < found[True][0]

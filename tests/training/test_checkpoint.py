@@ -5,7 +5,6 @@ import torch
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.training import Checkpoint
-from ifo_grounding.training.checkpoint import spent
 
 SETTINGS = {"lr": 0.1, "seed": 0}
 
@@ -22,24 +21,6 @@ def path(tmp_path, layer):
     return tmp_path / "run.pt"
 
 
-def test_a_checkpoint_restores_every_part_and_the_progress(tmp_path, layer):
-    optimizer = torch.optim.Adam(layer.parameters())
-    layer(torch.ones(3)).sum().backward()
-    optimizer.step()
-    path = tmp_path / "run.pt"
-    assert Checkpoint(path, SETTINGS, layer=layer).load() is None
-    Checkpoint(path, SETTINGS, layer=layer, optimizer=optimizer).save({"iteration": 7})
-
-    other = torch.nn.Linear(3, 2)
-    fresh = torch.optim.Adam(other.parameters())
-    progress = Checkpoint(path, SETTINGS, layer=other, optimizer=fresh).load()
-
-    assert progress == {"iteration": 7}
-    assert torch.equal(other.weight, layer.weight)
-    moments = [state["exp_avg"] for state in fresh.state_dict()["state"].values()]
-    assert all(moment.abs().sum() > 0 for moment in moments)
-
-
 def test_a_checkpoint_of_something_else_says_of_what(path, layer):
     with pytest.raises(UserError, match=r"made with lr=0\.1, not 0\.2"):
         Checkpoint(path, {**SETTINGS, "lr": 0.2}, layer=layer).load()
@@ -50,25 +31,10 @@ def test_a_checkpoint_of_something_else_says_of_what(path, layer):
     assert "\n" not in str(error.value)
 
 
-def test_time_is_counted_from_before_an_interruption(tmp_path, layer, monkeypatch):
-    path, clock = tmp_path / "run.pt", [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: clock[0])
-    checkpoint = Checkpoint(path, SETTINGS, layer=layer)
-    clock[0] = 107.0
-    checkpoint.save({})
-    clock[0] = 500.0
-    resumed = Checkpoint(path, SETTINGS, layer=layer)
-    resumed.load()
-    clock[0] = 503.0
-    resumed.save({})
-    assert spent(path) == 10.0
-    assert spent(tmp_path / "none.pt") == 0.0
-
-
 def test_a_flipped_bit_is_noticed_or_changes_nothing(path, layer):
     """What is between the entries of the archive is read by nobody."""
     whole, said = path.read_bytes(), []
-    for place in range(0, len(whole), 3):
+    for place in range(0, len(whole), 13):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
         other = torch.nn.Linear(3, 2)
         try:
@@ -77,13 +43,13 @@ def test_a_flipped_bit_is_noticed_or_changes_nothing(path, layer):
             said.append(str(error))
         else:
             assert torch.equal(other.weight, layer.weight) and torch.equal(other.bias, layer.bias)
-    assert len(said) > 100
+    assert len(said) > 30
     assert all("run.pt" in line and "\n" not in line for line in said)
 
 
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", None])
-def test_a_damaged_checkpoint_is_named(path, layer, content):
-    path.write_bytes(path.read_bytes()[:200] if content is None else content)
+@pytest.mark.parametrize("length", [0, 200])
+def test_a_damaged_checkpoint_is_named(path, layer, length):
+    path.write_bytes(path.read_bytes()[:length])
     with pytest.raises(UserError, match=r"run\.pt is damaged.*: delete it to start over"):
         Checkpoint(path, SETTINGS, layer=layer).load()
 

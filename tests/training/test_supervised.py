@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 
@@ -14,7 +13,7 @@ from ifo_grounding.objectives import ImitationLoss, InstructionLoss
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.training.updates import total_loss
 from training import tiny
-from training.tiny import same, weights
+from training.tiny import kill_at, same, weights
 
 SHAPES = Shapes(image_shape=(3, 16, 16), vocabulary_size=10, tile_size=8)
 
@@ -41,9 +40,9 @@ def imitation(dropout=0.0):
 def test_fit_learns_and_reports_each_iteration(buffer):
     loss = imitation()
     seen = []
-    config = FitConfig(steps=120, batch_size=64, lr=5e-2, iteration=40)
+    config = FitConfig(steps=60, batch_size=64, lr=1e-1, iteration=20)
     history = fit(loss, buffer, config, seed=0, log=lambda metrics, step: seen.append(step))
-    assert [metrics["step"] for metrics in history] == [40, 80, 120] == seen
+    assert [metrics["step"] for metrics in history] == [20, 40, 60] == seen
     assert history[-1]["loss_imitation"] < 0.1 < history[0]["loss_imitation"]
     assert history[-1]["accuracy"] == 1.0
     assert history[-1]["samples_per_second"] > 0
@@ -59,40 +58,24 @@ def test_fit_is_a_function_of_its_seed(buffer):
 
 
 def test_a_run_goes_on_within_a_round_of_all_samples(buffer, tmp_path):
-    data = buffer.storage.get(slice(0, 256))
+    def learned(**options):
+        loss, sampler = imitation(), SamplerWithoutReplacement()
+        stored = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=sampler)
+        stored.extend(buffer[:256])
+        fit(loss, stored, FitConfig(steps=12, batch_size=32, iteration=3), seed=0, **options)
+        return weights(loss)
 
-    def parts():
-        stored = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(256), sampler=SamplerWithoutReplacement()
-        )
-        stored.extend(data)
-        return imitation(), stored
-
-    config = FitConfig(steps=12, batch_size=32, iteration=3)
-    whole, stored = parts()
-    fit(whole, stored, config, seed=0)
-    options = {"seed": 0, "checkpoint": tmp_path / "fit.pt"}
-    fit(*parts(), config, **options, until=6)
-    resumed, stored = parts()
-    fit(resumed, stored, config, **options)
-    assert same(weights(resumed), weights(whole))
+    learned(checkpoint=tmp_path / "fit.pt", until=6)
+    assert same(learned(checkpoint=tmp_path / "fit.pt"), learned())
 
 
 def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path):
     config = FitConfig(steps=12, batch_size=32, iteration=3)
     whole = imitation(0.25)
     expected = fit(whole, buffer, config, seed=0)
-
-    class Killed(BaseException):
-        pass
-
-    def kill(metrics, step):
-        if step == 9:
-            raise Killed
-
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
-    with pytest.raises(Killed):
-        fit(imitation(0.25), buffer, config, log=kill, **options)
+    with pytest.raises(KeyboardInterrupt):
+        fit(imitation(0.25), buffer, config, log=kill_at(9), **options)
     resumed, steps = imitation(0.25), []
     history = fit(resumed, buffer, config, log=lambda _, step: steps.append(step), **options)
     assert steps == [9, 12]  # the iteration that was cut is done again
@@ -114,28 +97,15 @@ def test_the_schedule_warms_up_and_ends_near_zero():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"steps": 0},
-        {"batch_size": -1},
-        {"schedule": "linear"},
-        {"prior": -1},
-        {"grad_clip": 0},
-        {"grad_clip": -1.0},
-        {"warmup": 5.0},
-        {"warmup": -0.1},
-        {"validate_every": 0},
+        *({"steps": 0}, {"batch_size": -1}, {"schedule": "linear"}, {"prior": -1}),
+        *({"grad_clip": 0}, {"warmup": 5.0}, {"warmup": -0.1}, {"validate_every": 0}),
         {"weight_decay": math.inf},
     ],
+    ids=str,
 )
 def test_impossible_configs_are_refused(wrong):
     with pytest.raises(UserError):
         FitConfig(**wrong)
-
-
-def test_the_config_is_a_schema():
-    given = OmegaConf.merge(OmegaConf.structured(FitConfig), {"steps": 7, "lr": 1})
-    assert OmegaConf.to_object(given) == FitConfig(steps=7, lr=1.0)
-    with pytest.raises(UserError, match="unknown schedule 'linear'"):
-        OmegaConf.to_object(OmegaConf.merge(given, {"schedule": "linear"}))
 
 
 def test_the_prior_counts_for_the_more_the_fewer_the_samples(buffer):
@@ -143,7 +113,7 @@ def test_the_prior_counts_for_the_more_the_fewer_the_samples(buffer):
         loss = imitation()
         few = TensorDictReplayBuffer(storage=LazyTensorStorage(samples))
         few.extend(buffer[:samples])
-        fit(loss, few, FitConfig(steps=40, batch_size=32, lr=5e-3, prior=prior), seed=0)
+        fit(loss, few, FitConfig(steps=20, batch_size=32, lr=1e-2, prior=prior), seed=0)
         return sum(weight.square().sum().item() for weight in loss.parameters())
 
     assert size_of_weights(16, prior=200) < size_of_weights(256, prior=200)
@@ -158,9 +128,9 @@ def test_what_was_inherited_decays_to_what_it_was(buffer, tmp_path):
     with torch.no_grad():
         for weight in policy.parameters():
             weight.add_(0.5)  # far from zero
-    config = FitConfig(steps=40, batch_size=32, lr=1e-3, schedule="constant", prior=256 * 100)
+    config = FitConfig(steps=20, batch_size=16, lr=1e-3, schedule="constant", prior=256 * 100)
     loss, begun = suitability(policy), suitability(policy)
-    for until in (20, None):
+    for until in (10, None):
         fit(loss, buffer, config, seed=0, checkpoint=tmp_path / "fit.pt", until=until)
     origins = inherited(loss)
     assert len(origins) > 10
@@ -188,9 +158,7 @@ def test_what_cannot_be_sampled_is_refused():
 
 
 def test_numbers_of_numpy_do_not_break_a_checkpoint(buffer, tmp_path):
-    config = FitConfig(
-        steps=np.int64(4), batch_size=8, iteration=2, lr=np.logspace(-3, -2, 2)[0], weight_decay=0
-    )
+    config = FitConfig(steps=np.int64(4), batch_size=8, iteration=2, lr=np.logspace(-3, -2, 2)[0])
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt"}
     fit(imitation(), buffer, config, until=2, **options)
     assert len(fit(imitation(), buffer, config, **options)) == 2

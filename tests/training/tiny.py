@@ -8,6 +8,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules import ProbabilisticActor
 
 from ifo_grounding import keys
+from ifo_grounding.data import Demonstrations, labelled_buffer
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.tasks import grammar
 from ifo_grounding.training import SelfExaminationConfig
@@ -93,9 +94,30 @@ def make_env(reward_model=None, num_envs=16):
 
 
 def config(**kwargs):
-    chosen = {"iterations": 2, "steps": 8, "minibatch": 64, "value_warmup": 0, "epochs": 1}
+    chosen = {"iterations": 2, "steps": 4, "minibatch": 32, "value_warmup": 0, "epochs": 1}
     return SelfExaminationConfig(**{**chosen, **kwargs})
 
 
-TEACH = {"gamma": 0.0, "lr": 3e-2, "entropy": 0.0, "epochs": 3}
+def labelled(action, lengths=(3, 5, 2) * 20):
+    """Demonstrations of some lengths in which every label is one action."""
+    draw = torch.Generator().manual_seed(0)
+    frames = [
+        torch.randint(256, (length, 3, 48, 48), dtype=torch.uint8, generator=draw)
+        for length in lengths
+    ]
+    demos = Demonstrations.from_arrays(frames, ["move to the red circle"] * len(lengths))
+    return labelled_buffer(demos, torch.full((demos.transitions,), action))
+
+
+def kill_at(last):
+    """Return a log that ends the process before the checkpoint of a step."""
+
+    def log(metrics, step):
+        if step == last:
+            raise KeyboardInterrupt
+
+    return log
+
+
+TEACH = {"gamma": 0.0, "lr": 1e-1, "entropy": 0.0, "epochs": 3}
 """Options with which the tiny policy learns an action within a few iterations."""

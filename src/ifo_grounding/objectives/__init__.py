@@ -1,11 +1,11 @@
 """The losses: one LossModule per network, with configurable keys."""
 
-from ifo_grounding.objectives.base import SupervisedLoss, mode
+from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.objectives.goal import GoalLoss
 from ifo_grounding.objectives.imitation import ImitationLoss
 from ifo_grounding.objectives.instruction import InstructionLoss
 from ifo_grounding.objectives.inverse import InverseLoss
-from ifo_grounding.objectives.pairs import NegativeInstructions, pair_scores
+from ifo_grounding.objectives.pairs import NegativeInstructions
 from ifo_grounding.objectives.reward import RewardLoss
 
 __all__ = [
@@ -16,6 +16,4 @@ __all__ = [
     "NegativeInstructions",
     "RewardLoss",
     "SupervisedLoss",
-    "mode",
-    "pair_scores",
 ]

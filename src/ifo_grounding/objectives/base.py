@@ -7,54 +7,44 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives.common import LossModule
 
+from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import has_word_penalty, hidden_from_python, output_key
 
 
-@contextlib.contextmanager
-def mode(network: nn.Module, training: bool) -> Iterator[None]:
-    """Put every part of ``network`` into train or eval mode, and back into its own afterwards.
+@dataclass
+class NoKeys:
+    """No keys but the network's."""
 
-    >>> network = nn.Sequential(nn.Dropout(), nn.Linear(1, 1)).eval()
-    >>> with mode(network, training=True):
-    ...     inside = network[0].training
-    >>> inside, network[0].training
-    (True, False)
-    """
-    before = {part: part.training for part in network.modules()}
-    network.train(training)
-    try:
-        yield
-    finally:
-        for part, was in before.items():
-            part.training = was
+
+@dataclass
+class ActionKeys:
+    """Key of the actions, which ``set_keys`` changes; the other keys are the network's."""
+
+    action: NestedKey = keys.ACTION
+    """The action taken, or the labelled one, integer [*B]."""
 
 
 class SupervisedLoss(LossModule):
     """Base of the supervised losses of one network.
 
-    The network computes in the mode of the loss, whatever its own: with dropout after
-    ``loss.train()`` (as built), without after ``loss.eval()``. Afterwards each part of the network
-    is back in the mode it had, so a policy that collects in eval mode stays in it.
+    The network computes in the mode of the loss: with dropout after ``loss.train()`` (as built),
+    without after ``loss.eval()``. Afterwards each of its parts is back in the mode it had.
 
     Args:
-        network: the network to train, used as it is: nothing is copied or made stateless.
+        network: the network to train; it is not copied.
 
     Raises:
         UserError: where it is unclear which output of the network is to learn.
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """No keys but the network's."""
-
-    default_keys: Any = _AcceptedKeys
+    _AcceptedKeys: Any = NoKeys
     tensor_keys: Any
     written: str | None = None
     """How the output that is learned is named, where a network writes several."""
@@ -62,8 +52,14 @@ class SupervisedLoss(LossModule):
     def __init__(self, network: TensorDictModule) -> None:
         super().__init__()
         self.network = network
+        self.own_keys: list[NestedKey] = list(network.in_keys)
         self.reduction = "mean"
         self.output = None if self.written is None else output_key(network, self.written)
+
+    @property
+    def default_keys(self) -> Any:
+        """What ``set_keys`` goes back to."""
+        return self._AcceptedKeys
 
     @property
     def functional(self) -> bool:
@@ -72,27 +68,16 @@ class SupervisedLoss(LossModule):
 
     @property
     def capturable(self) -> bool:
-        """Whether a training step can be captured as a CUDA graph: all steps do the same.
+        """Whether all training steps do the same, and one can be captured as a CUDA graph.
 
-        They do not where a network looks at which words a batch says, or where random numbers come
-        from a generator of the loss.
+        They do not where a network looks at which words a batch says.
         """
-        own = any(getattr(part, "generator", None) is not None for part in self.modules())
-        return not own and not has_word_penalty(self.network)
-
-    def _own_keys(self) -> list[NestedKey]:
-        """Return the keys that are read because the network reads them."""
-        return list(self.network.in_keys)
+        return not has_word_penalty(self.network)
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Every key that :meth:`forward` reads: the network's, and those of ``set_keys``."""
-        own = self._own_keys()
-        return own + [key for key in vars(self.tensor_keys).values() if key not in own]
-
-    @in_keys.setter
-    def in_keys(self, values: object) -> None:
-        raise UserError("in_keys follow from the network and set_keys: use set_keys")
+        return list(dict.fromkeys([*self.own_keys, *vars(self.tensor_keys).values()]))
 
     def _require(self, tensordict: TensorDictBase) -> None:
         """Raise :class:`UserError` where a key is missing, for ``get`` would return None."""
@@ -103,15 +88,20 @@ class SupervisedLoss(LossModule):
                 "and the in_keys of the network change the names"
             )
 
-    def _mode(self) -> contextlib.AbstractContextManager[None]:
-        return mode(self.network, self.training)
+    @contextlib.contextmanager
+    def _mode(self) -> Iterator[None]:
+        """Put every part of the network into the mode of the loss, and back afterwards."""
+        before = {part: part.training for part in self.network.modules()}
+        self.network.train(self.training)
+        try:
+            yield
+        finally:
+            for part, was in before.items():
+                part.training = was
 
     def _mean(self, values: Tensor, tensordict: TensorDictBase | None = None) -> Tensor:
         """Return the mean of a metric over the samples that a mask of TorchRL leaves."""
         return self._reduce_loss(values.detach().float(), tensordict)
-
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        """No value estimator: nothing to forward."""
 
 
 def flat(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
@@ -120,16 +110,10 @@ def flat(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
     return chosen.reshape(chosen.batch_size.numel()) if chosen.ndim else chosen.unsqueeze(0)
 
 
-def scalars(**values: Tensor) -> TensorDict:
-    """Return a tensordict without batch dims."""
-    return TensorDict(dict(values), [])
-
-
 def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = None) -> None:
-    """Raise :class:`UserError` unless ``action`` has the shape that the network acts in.
+    """Raise :class:`UserError` unless ``action`` has this shape and is one of ``count``, if given.
 
-    Where ``count`` actions are known, indices have to be of them. On a GPU, which would have to be
-    waited for, and inside the compiler they are not checked.
+    Numbers are not checked on a GPU, which would have to be waited for, and inside the compiler.
     """
     if tuple(action.shape) != tuple(expected):
         raise UserError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import at_least_one
-from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
+from ifo_grounding.objectives.base import SupervisedLoss, flat
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
 
@@ -23,24 +22,17 @@ class GoalLoss(SupervisedLoss):
 
     An extension, which assumes that demonstrations end in success. Positives are final frames with
     their instructions. Negatives are, with half the weight each, earlier frames with their
-    instructions, and final frames with others of the pool, of which the probable false ones are
-    removed. Positives and negatives weigh the same; a class that a batch lacks counts 0. Writes
-    ``loss_goal``, ``final_probability``, ``unfinished_probability``, ``negative_probability`` and
-    ``removed``.
+    instructions, and final frames with others of the pool. Positives and negatives weigh the same;
+    a class that a batch lacks counts 0. Writes ``loss_goal``, ``final_probability``,
+    ``unfinished_probability``, ``negative_probability`` and ``removed``.
 
     Args:
-        network: first image, image and instruction to a logit, as ``make_goal_classifier`` builds
-            it.
+        network: first image, image and instruction to a logit, as ``make_goal_classifier`` builds.
         pool: token ids [P, L] of the instructions of the demonstrations.
+        removal_rate: share of a batch's negatives to remove, those scored highest; None estimates.
+        warmup: share of training before which none is removed.
+        near: share of the negatives that differ from the own instruction in few words.
         negatives: how many other instructions each final frame is scored with.
-        removal_rate: share of a batch's other instructions to remove, those scored highest; None
-            estimates it.
-        warmup: share of training before which none is removed; see :meth:`set_progress`.
-        near: share of the other instructions that differ from the own one in few words.
-        generator: where random numbers come from; None is the global generator.
-
-    Raises:
-        UserError: for a pool of fewer than two different instructions, or values out of range.
 
     >>> from ifo_grounding.networks import Shapes, make_goal_classifier
     >>> pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
@@ -60,7 +52,6 @@ class GoalLoss(SupervisedLoss):
         final: NestedKey = "final"
         """Whether a frame is the last of its demonstration, bool [*B, 1]."""
 
-    default_keys: Any = _AcceptedKeys
     written = keys.GOAL_SCORE
     out_keys = [  # noqa: RUF012
         "loss_goal",
@@ -79,11 +70,10 @@ class GoalLoss(SupervisedLoss):
         removal_rate: float | None = 0.0,
         warmup: float = 1 / 3,
         near: float = 0.0,
-        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
         self.count = at_least_one("negatives", negatives)
-        self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator, near)
+        self.negatives = NegativeInstructions(pool, removal_rate, warmup, near)
 
     def set_progress(self, fraction: float) -> None:
         """Say which share of training is done, in [0, 1]; until told, training counts as late."""
@@ -118,10 +108,12 @@ class GoalLoss(SupervisedLoss):
         finished = masked_mean(F.softplus(-own), last)
         unfinished = masked_mean(F.softplus(early), before)
         elsewhere = masked_mean(F.softplus(other), kept)
-        return scalars(
-            loss_goal=(finished + (unfinished + elsewhere) / 2) / 2,
-            final_probability=masked_mean(own.detach().sigmoid(), last),
-            unfinished_probability=masked_mean(early.detach().sigmoid(), before),
-            negative_probability=masked_mean(other.detach().sigmoid(), told),
-            removed=masked_mean((~kept).float(), told),
+        return TensorDict(
+            {
+                "loss_goal": (finished + (unfinished + elsewhere) / 2) / 2,
+                "final_probability": masked_mean(own.detach().sigmoid(), last),
+                "unfinished_probability": masked_mean(early.detach().sigmoid(), before),
+                "negative_probability": masked_mean(other.detach().sigmoid(), told),
+                "removed": masked_mean((~kept).float(), told),
+            }
         )

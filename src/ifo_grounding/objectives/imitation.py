@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
-from tensordict.utils import NestedKey
-from torch.distributions import Categorical, Distribution
+from torch.distributions import Categorical
 
-from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import has_word_penalty, set_word_swapping, take_word_penalty
-from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
+from ifo_grounding.objectives.base import ActionKeys, SupervisedLoss, check_action
 
 CONFIDENCE = 4
 """Power of the likelihood that weighs the word penalty: a policy that knows little pays little."""
@@ -26,18 +21,16 @@ class ImitationLoss(SupervisedLoss):
     takes integer actions for logits.
 
     Of a network with :class:`~ifo_grounding.networks.WordMaps`, which reads word by word, it also
-    writes ``loss_words``, which regularises what words say about colours and about form; its weight
-    grows with the likelihood of the actions. A word that needs but one of the two then keeps to it.
-    Train such a network eagerly: inside ``torch.compile`` it does not tell words apart that occur
-    from those that do not, and there is no penalty.
+    writes ``loss_words``, which regularises what words say about colours and about form: a word
+    that needs but one of the two keeps to it. Its weight grows with the likelihood of the actions.
+    Train such a network eagerly: inside ``torch.compile`` there is no penalty.
 
     Args:
         network: a policy with ``get_dist``, such as ``make_policy`` or TorchRL's
             ``ProbabilisticActor`` give, or a ``TensorDictSequential`` that contains one.
         word_penalty: weight of ``loss_words``.
-        words_from: share of training, see :meth:`set_progress`, before which words are neither
-            penalised nor swapped. Where actions are easy to guess without words, they are otherwise
-            held to one meaning before they have any.
+        words_from: share of training before which words are neither penalised nor swapped. Where
+            actions are easy to guess without words, they would be held to one meaning too early.
 
     >>> import torch
     >>> from ifo_grounding.networks import Shapes, make_policy
@@ -50,14 +43,7 @@ class ImitationLoss(SupervisedLoss):
     >>> losses["loss_imitation"].backward()
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys that ``set_keys`` changes; the inputs' keys are the policy's."""
-
-        action: NestedKey = keys.ACTION
-        """The labelled action, integer [*B]."""
-
-    default_keys: Any = _AcceptedKeys
+    _AcceptedKeys = ActionKeys
 
     def __init__(
         self,
@@ -66,13 +52,17 @@ class ImitationLoss(SupervisedLoss):
         word_penalty: float = 0.02,
         words_from: float = 0.0,
     ) -> None:
-        if not _gives_distribution(network):
+        parts = _parts(network)
+        while parts and not hasattr(parts[-1], "get_dist"):
+            parts.pop()
+        if not parts:
             raise UserError(
                 f"ImitationLoss trains policies with get_dist, as make_policy or TorchRL's "
                 f"ProbabilisticActor give, or a TensorDictSequential with one in it, got "
                 f"{type(network).__name__}"
             )
         super().__init__(network)
+        self.parts = parts
         if not 0 <= words_from <= 1:
             raise UserError(f"words_from is a share of training in [0, 1], got {words_from}")
         words = ["loss_words"] if has_word_penalty(network) else []
@@ -92,37 +82,31 @@ class ImitationLoss(SupervisedLoss):
         self._require(tensordict)
         action = tensordict.get(self.tensor_keys.action)
         take_word_penalty(self.network)  # that another loss left
+        inputs = tensordict.select(*self.network.in_keys)
+        *before, policy = self.parts
         with self._mode():
-            dist = _distribution(self.network, tensordict.select(*self.network.in_keys))
+            for part in before:
+                inputs = part(inputs)
+            dist = policy.get_dist(inputs)
         likeliest = dist.mode
         count = dist.logits.shape[-1] if isinstance(dist, Categorical) else None
         check_action(action, likeliest.shape, count)
         loss = -dist.log_prob(action)
         right = (likeliest == action).reshape(*loss.shape, -1).all(-1)
         penalty = take_word_penalty(self.network)  # none in eval mode
-        losses = {"loss_imitation": self._reduce_loss(loss, tensordict)}
+        losses = TensorDict({"loss_imitation": self._reduce_loss(loss, tensordict)})
         if "loss_words" in self.out_keys:
             likelihood = (-self._mean(loss, tensordict)).exp()
             weight = self.word_penalty if self.holds_words else 0.0
             penalty = likelihood.new_zeros(()) if penalty is None else penalty
             losses["loss_words"] = weight * likelihood**CONFIDENCE * penalty
-        accuracy, entropy = self._mean(right, tensordict), self._mean(dist.entropy(), tensordict)
-        return scalars(**losses, accuracy=accuracy, entropy=entropy)
+        losses["accuracy"] = self._mean(right, tensordict)
+        losses["entropy"] = self._mean(dist.entropy(), tensordict)
+        return losses
 
 
-def _gives_distribution(module: object) -> bool:
-    """Whether a policy, or a part of it, has ``get_dist``."""
-    parts = module.module if isinstance(module, TensorDictSequential) else ()
-    return hasattr(module, "get_dist") or any(map(_gives_distribution, parts))
-
-
-def _distribution(module: Any, inputs: TensorDictBase) -> Distribution:
-    """Return the distribution of actions, of the last part of a sequence that gives one."""
-    if hasattr(module, "get_dist"):
-        return module.get_dist(inputs)
-    parts = list(module.module)
-    while not _gives_distribution(parts[-1]):
-        parts.pop()
-    for part in parts[:-1]:
-        inputs = part(inputs)
-    return _distribution(parts[-1], inputs)
+def _parts(module: TensorDictModuleBase) -> list[TensorDictModuleBase]:
+    """Return what a sequence does one after the other; a policy is one part."""
+    if hasattr(module, "get_dist") or not isinstance(module, TensorDictSequential):
+        return [module]
+    return [part for child in module.module for part in _parts(child)]

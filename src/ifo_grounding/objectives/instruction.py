@@ -13,7 +13,7 @@ from torch import Tensor
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.modules import set_word_swapping
-from ifo_grounding.objectives.base import SupervisedLoss, flat, scalars
+from ifo_grounding.objectives.base import SupervisedLoss, flat
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
 UNLABELLED = ("removal", "mixture")
@@ -24,46 +24,33 @@ class InstructionLoss(SupervisedLoss):
     """Binary cross entropy of a scene's own instruction against others of the pool (2nd phase).
 
     Positives are the first frames of demonstrations with their instructions; negatives are other
-    instructions of the pool, never the same, of which the probable false ones are removed.
-    Positives and negatives weigh the same, whatever their numbers. Writes ``loss_instruction``,
+    instructions of the pool. Positives and negatives weigh the same. Writes ``loss_instruction``,
     ``positive_probability``, ``negative_probability`` and ``removed``, a share.
-
-    ``contrast`` adds the cross entropy of finding a scene's own instruction among its negatives
-    (InfoNCE, van den Oord et al. 2018). In large pools nearly all negatives name things that the
-    scene lacks, and are soon told apart; what is then left of the binary loss says hardly anything
-    of the others, while the contrast is made of them. An extension of the paper.
-
-    With the 12 instructions of ``move`` some 4 of 11 negatives suit the scene, and without removal
-    the best possible classifier says 0.69 where the paper's threshold is 0.8. In large pools false
-    negatives are rare. So the share to remove is estimated, unless it is given.
-
-    Few demonstrations show few scenes, and what suits these is soon known by heart. With ``states``
-    each demonstration's scene is also told apart from fresh states of the simulator, given its own
-    instruction: further pairs of which few are suitable, in scenes without end. An extension.
 
     Args:
         network: an image and an instruction to a logit, as ``make_instruction_classifier`` builds.
         pool: token ids [P, L] of the instructions of the demonstrations.
+        removal_rate: share of a batch's negatives to remove, those scored highest; None estimates.
+        warmup: share of training before which none is removed.
+        near: share of the negatives that differ from the own instruction in few words.
         negatives: how many negatives each scene is scored with, at most as many as there are other
             instructions; they share its image's encoding.
-        removal_rate: share of a batch's negatives to remove, those scored highest; None estimates
-            from their scores how many are suitable.
-        warmup: share of training before which none is removed; see :meth:`set_progress`.
-        contrast: weight of the contrast, in nats.
+        contrast: weight of the cross entropy of finding a scene's own instruction among its
+            negatives, in nats (InfoNCE, van den Oord et al. 2018): for large pools, where nearly
+            all negatives name things that the scene lacks. An extension of the paper.
         unlabelled: what is done about false negatives. ``"removal"`` drops the negatives scored
             highest; ``"mixture"`` drops none: :meth:`calibrate` then counts how many suitable ones
             they hold (Elkan and Noto 2008).
-        near: share of the negatives that differ from the own instruction in few words.
-        states: images of fresh states of the simulator, uint8 [S, C, H, W].
+        states: images of fresh states of the simulator, uint8 [S, C, H, W], from which each
+            demonstration's scene is told apart, too, given its own instruction: for few
+            demonstrations, whose scenes are soon known by heart. An extension.
         fresh: how many of these, drawn anew for each batch, every instruction of it is scored with.
         swap_words: whether training swaps words for others where the network reads word by word
-            (``"strong"``), so that what they count for cannot depend on which they are: for
-            combinations that no demonstration names. It takes many demonstrations to learn so.
-        generator: where random numbers come from; None is the global generator.
+            (``"strong"``): for combinations that no demonstration names. It takes many
+            demonstrations to learn so.
 
     Raises:
-        UserError: for a pool of fewer than two different instructions, states that are no images,
-            or values out of range.
+        UserError: for states that are no images, or values out of range.
 
     >>> from ifo_grounding.networks import Shapes, make_instruction_classifier
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
@@ -76,7 +63,6 @@ class InstructionLoss(SupervisedLoss):
     """
 
     states: Tensor | None
-
     written = keys.SUITABILITY
     out_keys = [  # noqa: RUF012
         "loss_instruction",
@@ -99,20 +85,17 @@ class InstructionLoss(SupervisedLoss):
         states: Tensor | None = None,
         fresh: int = 32,
         swap_words: bool = False,
-        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__(network)
-        negatives = at_least_one("negatives", negatives)
         if contrast < 0:
             raise UserError(f"contrast is a weight of at least 0, got {contrast}")
-        fresh = at_least_one("fresh", fresh)
         if states is not None and (states.ndim != 4 or not len(states)):
             raise UserError(f"states must be images [S, C, H, W], got shape {list(states.shape)}")
         check_choice("treatment of unlabelled pairs", unlabelled, UNLABELLED)
         self.contrast, self.unlabelled = contrast, unlabelled
-        self.negatives = NegativeInstructions(pool, removal_rate, warmup, generator, near)
-        self.count = min(negatives, len(self.negatives.pool) - 1)
-        self.fresh = fresh
+        self.negatives = NegativeInstructions(pool, removal_rate, warmup, near)
+        self.count = min(at_least_one("negatives", negatives), len(self.negatives.pool) - 1)
+        self.fresh = at_least_one("fresh", fresh)
         set_word_swapping(network, swap_words)
         self.register_buffer("states", states, persistent=False)
 
@@ -123,14 +106,11 @@ class InstructionLoss(SupervisedLoss):
     def calibrate(self) -> float:
         """Let the network's probabilities count how rare suitable pairs are; return their share.
 
-        In training positives and negatives weigh the same, so that a probability is that of a pair
-        which is suitable as likely as not. Afterwards it is that of a random pair of a fresh scene
-        and the pool, and a threshold means the same for pools in which one of three instructions
-        suits and for those in which one of three hundred does. Where so few suit that none were
-        removed, the negatives are taken for what they are, a mixture that holds suitable pairs. One
-        instruction of the pool at least suits the scene of a demonstration, its own.
-
-        The loss itself never reads them: training goes on from logits as they were learned.
+        In training positives and negatives weigh the same, as if every second pair suited.
+        Afterwards a probability is that of a random pair of a fresh scene and the pool. Where no
+        negatives were removed, they are a mixture that holds suitable pairs. One instruction of the
+        pool at least suits a demonstration's scene, its own. Training goes on from logits as they
+        were learned.
 
         Raises:
             UserError: where the share is unknown, for the removal rate was given, or the network
@@ -143,9 +123,7 @@ class InstructionLoss(SupervisedLoss):
                 "shifts its logits: see networks.PairScorer.expect"
             )
         share = max(self.negatives.suitable_share(), 1 / len(self.negatives.pool))
-        kept = self.unlabelled == "removal" and not self.negatives.share
-        mixed = kept or self.unlabelled == "mixture"
-        expect(share, mixed)
+        expect(share, self.unlabelled == "mixture" or not self.negatives.removal_rate)
         return share
 
     @property
@@ -169,7 +147,8 @@ class InstructionLoss(SupervisedLoss):
             near = slice(self.negatives.uniform(self.count), self.count)
             random = torch.cat([other[:, : near.start], other[:, near.stop :]], 1)
             self.negatives.watch(own, random)
-        kept = self._kept(other)
+        mixture = self.unlabelled == "mixture"
+        kept = torch.ones_like(other).bool() if mixture else self.negatives.keep(other)
         loss = (F.softplus(-own).mean() + masked_mean(F.softplus(other), kept)) / 2
         if self.contrast:
             told = other.masked_fill(~kept, -torch.inf)
@@ -177,25 +156,21 @@ class InstructionLoss(SupervisedLoss):
             for rivals in told.split(kinds, 1):
                 logits = torch.cat([own.unsqueeze(1), rivals], 1)
                 loss = loss + self.contrast * (logits.logsumexp(1) - own).mean()
-        return scalars(
-            loss_instruction=loss,
-            positive_probability=self._mean(own.sigmoid()),
-            negative_probability=self._mean(other.sigmoid()),
-            removed=1 - self._mean(kept),
+        return TensorDict(
+            {
+                "loss_instruction": loss,
+                "positive_probability": self._mean(own.sigmoid()),
+                "negative_probability": self._mean(other.sigmoid()),
+                "removed": 1 - self._mean(kept),
+            }
         )
-
-    def _kept(self, other: Tensor) -> Tensor:
-        """Return which negatives count, a mask of their logits."""
-        if self.unlabelled == "mixture":
-            return torch.ones_like(other, dtype=torch.bool)
-        return self.negatives.keep(other)
 
     def _elsewhere(self, batch: TensorDictBase) -> Tensor:
         """Score each row's own instruction in some fresh states: logits [N, fresh]."""
         assert self.states is not None
         image, instruction = self.network.in_keys
         spoken = batch.get(instruction).expand(self.fresh, -1, -1)
-        rows = self.negatives.randint(0, len(self.states), (self.fresh,))
+        rows = torch.randint(len(self.states), (self.fresh,), device=self.states.device)
         scenes = TensorDict({image: self.states[rows], instruction: spoken[:, 0]}, [self.fresh])
         first, others = pair_scores(self.network, scenes, spoken[:, 1:], self.output)
         return torch.cat([first.unsqueeze(1), others], 1).T

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from tensordict.utils import NestedKey
 
 from ifo_grounding import keys
-from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
+from ifo_grounding.objectives.base import ActionKeys, SupervisedLoss, check_action
 
 
 class InverseLoss(SupervisedLoss):
@@ -32,14 +28,7 @@ class InverseLoss(SupervisedLoss):
     >>> losses["loss_inverse"].backward()
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys that ``set_keys`` changes; the images' keys are the network's."""
-
-        action: NestedKey = keys.ACTION
-        """The action taken, integer [*B]."""
-
-    default_keys: Any = _AcceptedKeys
+    _AcceptedKeys = ActionKeys
     out_keys = ["loss_inverse", "accuracy"]  # noqa: RUF012
     written = keys.LOGITS
 
@@ -54,9 +43,11 @@ class InverseLoss(SupervisedLoss):
         check_action(action, logits.shape[:-1], logits.shape[-1])
         action = action.long()
         loss = F.cross_entropy(
-            logits.reshape(-1, logits.shape[-1]), action.reshape(-1), reduction="none"
+            logits.reshape(-1, logits.shape[-1]), action.flatten(), reduction="none"
         )
-        return scalars(
-            loss_inverse=self._reduce_loss(loss.reshape(action.shape), tensordict),
-            accuracy=self._mean(logits.argmax(-1) == action, tensordict),
+        return TensorDict(
+            {
+                "loss_inverse": self._reduce_loss(loss.view_as(action), tensordict),
+                "accuracy": self._mean(logits.argmax(-1) == action, tensordict),
+            }
         )

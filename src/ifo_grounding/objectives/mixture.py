@@ -8,22 +8,16 @@ import torch
 from torch import Tensor, nn
 
 SLACK = 0.01
+FAILURE = 0.1
+"""Probability with which the bound may fail."""
 
 
-def best_bin_estimate(positive: Tensor, unlabelled: Tensor, delta: float = 0.1) -> float:
-    """Estimate the share of positives among unlabelled samples from a classifier's scores.
+def best_bin_estimate(positive: Tensor, unlabelled: Tensor) -> float:
+    """Estimate the share of positives [P] among unlabelled samples [U] from a classifier's scores.
 
     Above a threshold that hardly any true negative passes, the unlabelled are as frequent as the
     positives times the share. The threshold is the one with the least upper confidence bound
     (Garg et al., "Mixture Proportion Estimation and PU Learning: A Modern Approach", 2021).
-
-    Args:
-        positive: scores of positives [P].
-        unlabelled: scores of unlabelled samples [U].
-        delta: probability with which the bound may fail.
-
-    Returns:
-        The share, in [0, 1].
 
     >>> positive = torch.linspace(1, 2, 5000)
     >>> negative = torch.linspace(-2, -1, 9000)
@@ -35,7 +29,7 @@ def best_bin_estimate(positive: Tensor, unlabelled: Tensor, delta: float = 0.1) 
     above = torch.arange(1, n_positive + 1, device=positive.device) / n_positive
     ordered = unlabelled.sort().values
     passed = (n_unlabelled - torch.searchsorted(ordered, thresholds)) / n_unlabelled
-    width = math.sqrt(math.log(4 / delta) / 2) * (n_positive**-0.5 + n_unlabelled**-0.5)
+    width = math.sqrt(math.log(4 / FAILURE) / 2) * (n_positive**-0.5 + n_unlabelled**-0.5)
     best = ((passed + (1 + SLACK) * width) / above).argmin()
     return float((passed[best] / above[best]).clamp(0, 1))
 

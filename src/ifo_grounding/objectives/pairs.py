@@ -8,19 +8,14 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from ifo_grounding import keys
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import output_key
 from ifo_grounding.objectives.mixture import MixtureEstimate
 
 MOST_REMOVED = 0.5
 LEAST_REMOVED = 0.05
-"""Where fewer pairs than this are suitable, false negatives hardly matter, and what an imperfect
-classifier would remove are mostly the hardest true ones."""
-
+"""Where fewer pairs than this are suitable, a classifier would remove mostly true negatives."""
 NEAREST = 64
-"""How many instructions count as near in their words."""
 WORDS_AT_ONCE = 1 << 20
 """Words that are compared together, to bound memory."""
 
@@ -29,23 +24,20 @@ class NegativeInstructions(nn.Module):
     """Draws instructions from a pool that differ from a given one, and removes likely mistakes.
 
     A random other instruction may suit a scene just as well. So after a warm-up the share
-    ``removal_rate`` of a batch's negatives that the classifier likes best is dropped (Bahdanau et
-    al. 2019, whom the paper cites). The share can be estimated from the scores of positives and
-    negatives (:func:`~ifo_grounding.objectives.mixture.best_bin_estimate`). Whether any
-    are dropped, and how many at most, is settled when the warm-up ends: what is dropped is no
-    longer held down, scores higher, and would make the estimate rise further and further.
+    ``removal_rate`` of a batch's negatives with the highest scores is dropped (Bahdanau et al.
+    2019). Whether any are dropped, and how many at most, is settled when the warm-up ends: what is
+    dropped is no longer held down, scores higher, and would make an estimate rise further.
 
     Args:
         pool: token ids [P, L]; repeated rows count once.
-        removal_rate: share of negatives to drop, in [0, 1); None estimates it.
+        removal_rate: share of negatives to drop, in [0, 1); None estimates it from the scores of
+            positives and negatives (:func:`~ifo_grounding.objectives.mixture.best_bin_estimate`).
         warmup: share of training before which none is dropped.
         near: share of the negatives that are drawn among the ``NEAREST`` instructions of the pool
             that differ from the given one in the fewest words, instead of among all.
-        generator: where random numbers come from; None is the global generator.
 
     Raises:
-        UserError: where the pool holds fewer than two different instructions, or values are out of
-            range.
+        UserError: for a pool of fewer than two different instructions, or values out of range.
 
     >>> negatives = NegativeInstructions(torch.tensor([[1, 0], [2, 0], [2, 0]]), removal_rate=0.5)
     >>> negatives.draw(torch.tensor([[1, 0], [2, 0]]), 1).tolist()
@@ -63,7 +55,6 @@ class NegativeInstructions(nn.Module):
         pool: Tensor,
         removal_rate: float | None,
         warmup: float = 1 / 3,
-        generator: torch.Generator | None = None,
         near: float = 0.0,
     ) -> None:
         super().__init__()
@@ -84,7 +75,6 @@ class NegativeInstructions(nn.Module):
         self.given = removal_rate or 0.0
         self.estimate = MixtureEstimate() if removal_rate is None else None
         self.warmup, self.near = warmup, near
-        self.generator = generator
         self.progress = 1.0
         self.neighbours: dict[tuple[int, ...], Tensor] = {}
 
@@ -110,22 +100,18 @@ class NegativeInstructions(nn.Module):
         return max(1, round((1 - self.near) * count))
 
     def _among_all(self, instruction: Tensor, count: int) -> Tensor:
-        """Draw uniformly among all others.
-
-        A draw that hits the row's own instruction is moved on by a random number of places, which
-        keeps it uniform, for the rows of the pool are distinct.
-        """
-        size = len(self.pool)
-        shape = (len(instruction), count)
-        index = self.randint(0, size, shape)
-        moved = (index + self.randint(1, size, shape)) % size
+        """Draw uniformly among all others: the own one is moved on by a random number of places."""
+        size, shape, device = len(self.pool), (len(instruction), count), self.pool.device
+        index = torch.randint(size, shape, device=device)
+        moved = (index + torch.randint(1, size, shape, device=device)) % size
         same = (self.pool[index] == instruction.unsqueeze(1)).all(-1)
         return self.pool[torch.where(same, moved, index)]
 
     def _nearby(self, instruction: Tensor, count: int) -> Tensor:
         """Draw uniformly among the nearest others."""
         nearest = self._nearest(instruction) if instruction.is_cuda else self._known(instruction)
-        chosen = self.randint(0, nearest.shape[1], (len(instruction), count))
+        shape = (len(instruction), count)
+        chosen = torch.randint(nearest.shape[1], shape, device=nearest.device)
         return self.pool[nearest.gather(1, chosen)]
 
     def _known(self, instruction: Tensor) -> Tensor:
@@ -147,22 +133,13 @@ class NegativeInstructions(nn.Module):
     def watch(self, own: Tensor, other: Tensor) -> None:
         """Learn the share of suitable ones from scores of positives [N] and random others [*, K].
 
-        Of the negatives no more are remembered than reach back as far as the positives: scores grow
-        while a classifier learns, and later ones of one kind would pass for better ones.
+        Both reach back as far: scores grow while a classifier learns, and later ones of one kind
+        would pass for better ones.
         """
         if self.estimate is not None:
             count = other.shape[-1]
             as_far = self.estimate.ratio * own.numel() * count // max(other.numel(), 1)
             self.estimate.add(own, other[..., : max(as_far, 1)])
-
-    @property
-    def removal_rate(self) -> float:
-        """Share of negatives to drop after the warm-up: as given, or as estimated by now."""
-        if self.estimate is None:
-            return self.given
-        share = self.suitable_share()
-        few = self.undecided and share < LEAST_REMOVED
-        return 0.0 if few else min(share, float(self.bound))
 
     @property
     def keeps_all(self) -> bool:
@@ -181,51 +158,35 @@ class NegativeInstructions(nn.Module):
         return min(self.estimate.share(), MOST_REMOVED, bound)
 
     @property
-    def undecided(self) -> bool:
-        """Whether it is still open if any are dropped, and how many at most."""
-        return float(self.bound) == 1
-
-    @property
-    def share(self) -> float:
-        """Share of suitable negatives, as far as it is to be heeded by now."""
-        return self.removal_rate if self.progress >= self.warmup else 0.0
+    def removal_rate(self) -> float:
+        """Share of negatives to drop by now: none before the warm-up is over."""
+        if self.progress < self.warmup:
+            return 0.0
+        if self.estimate is None:
+            return self.given
+        share, bound = self.suitable_share(), float(self.bound)
+        return 0.0 if bound == 1 and share < LEAST_REMOVED else min(share, bound)
 
     def keep(self, scores: Tensor) -> Tensor:
         """Return a mask of ``scores`` [*] without the top share that is likely suitable."""
-        share, over = self.share, self.progress >= self.warmup
-        if self.training and over and self.estimate is not None and self.undecided:
+        share = self.removal_rate
+        over = self.training and self.progress >= self.warmup
+        if over and self.estimate is not None and float(self.bound) == 1:
             self.bound.fill_(share)
         mask = torch.ones(scores.numel(), dtype=torch.bool, device=scores.device)
         if drop := int(share * scores.numel()):
             mask[scores.detach().flatten().topk(drop).indices] = False
         return mask.reshape(scores.shape)
 
-    def randint(self, low: int, high: int, shape: tuple[int, ...]) -> Tensor:
-        """Draw integers from ``low`` up to ``high``, which is left out."""
-        device = self.pool.device if self.generator is None else self.generator.device
-        numbers = torch.randint(low, high, shape, generator=self.generator, device=device)
-        return numbers.to(self.pool.device)
-
 
 def pair_scores(
-    network: TensorDictModule,
-    batch: TensorDictBase,
-    others: Tensor,
-    output: NestedKey | None = None,
+    network: TensorDictModule, batch: TensorDictBase, others: Tensor, output: NestedKey
 ) -> tuple[Tensor, Tensor]:
-    """Score each row's own instruction and others: logits [N] and [N, K].
+    """Score each row's own instruction and others, token ids [N, K, L]: logits [N] and [N, K].
 
     A network with ``encode_scenes``, ``encode_instruction`` and ``score_candidates`` encodes each
-    row's images and each distinct instruction once; any other runs once per pair. On a GPU every
-    instruction is encoded where scenes share nothing either: finding the distinct ones would wait
-    for it.
-
-    Args:
-        network: images and an instruction, its last input, to a logit [*B, 1].
-        batch: its inputs, batch size [N].
-        others: token ids [N, K, L].
-        output: where the network writes; by default ``suitability``, ``goal_score``, or all that it
-            writes.
+    row's images and each distinct instruction once; any other runs once per pair. On a GPU, where
+    finding the distinct ones would wait for it, all are encoded unless scenes are shared.
     """
     *pixel_keys, instruction_key = network.in_keys
     both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
@@ -243,16 +204,11 @@ def pair_scores(
     else:
         rows = torch.arange(len(both), device=both.device).repeat_interleave(count)
         pairs = batch.select(*pixel_keys)[rows].set(instruction_key, both.flatten(0, 1))
-        written = output or output_key(network, keys.SUITABILITY, keys.GOAL_SCORE)
-        scores = network(pairs).get(written)
+        scores = network(pairs).get(output)
     scores = scores.reshape(-1, count)
     return scores[:, 0], scores[:, 1:]
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Return the mean of ``values`` where ``mask``, 0 where nowhere.
-
-    >>> float(masked_mean(torch.tensor([1.0, 3.0]), torch.tensor([False, True])))
-    3.0
-    """
+    """Return the mean of ``values`` where ``mask``, 0 where nowhere."""
     return torch.where(mask, values, 0).sum() / mask.sum().clamp_min(1)

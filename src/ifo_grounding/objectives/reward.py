@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one
-from ifo_grounding.objectives.base import SupervisedLoss, check_action, scalars
+from ifo_grounding.objectives.base import ActionKeys, SupervisedLoss, check_action
 
 
 class RewardLoss(SupervisedLoss):
     """Binary cross entropy of right actions against wrong ones (2nd phase of the paper).
 
     Positives are the labelled actions of demonstrations. Before self-examination (:meth:`forward`)
-    negatives are randomly different actions; during it (:meth:`adversarial`) they are the policy's
-    own actions. Positives and negatives weigh the same. Both write ``loss_reward``,
-    ``positive_probability`` and ``negative_probability``.
+    negatives are randomly different actions, during it (:meth:`adversarial`) the policy's own.
+    Positives and negatives weigh the same. Both write ``loss_reward``, ``positive_probability`` and
+    ``negative_probability``.
 
     Args:
         network: an image, an instruction and an action, its last input, to a logit, as
-            ``make_reward_model`` builds it. With ``all_actions`` images are encoded once for both
-            actions.
+            ``make_reward_model`` builds it. One with ``all_actions`` encodes an image once.
         n_actions: number of actions; networks of this library know theirs.
-        generator: where random numbers come from; None is the global generator.
 
     >>> from ifo_grounding.networks import Shapes, make_reward_model
     >>> rwd = make_reward_model(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
@@ -42,25 +36,13 @@ class RewardLoss(SupervisedLoss):
     >>> RewardLoss(rwd)(batch)["loss_reward"].backward()
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys that ``set_keys`` changes; the inputs' keys are the network's."""
-
-        action: NestedKey = keys.ACTION
-        """The labelled action, integer [*B]."""
-
-    default_keys: Any = _AcceptedKeys
+    _AcceptedKeys = ActionKeys
     written = keys.ACTION_SCORE
     out_keys = ["loss_reward", "positive_probability", "negative_probability"]  # noqa: RUF012
 
-    def __init__(
-        self,
-        network: TensorDictModule,
-        *,
-        n_actions: int | None = None,
-        generator: torch.Generator | None = None,
-    ) -> None:
+    def __init__(self, network: TensorDictModule, *, n_actions: int | None = None) -> None:
         super().__init__(network)
+        self.own_keys = self.own_keys[:-1]  # the last is an action, the labelled one or another
         known = getattr(getattr(network, "shapes", None), "n_actions", None)
         count = known if n_actions is None else n_actions
         if count is None:
@@ -68,22 +50,17 @@ class RewardLoss(SupervisedLoss):
         self.n_actions = at_least_one("n_actions", count)
         if self.n_actions < 2:
             raise UserError("a single action has no different ones to serve as negatives")
-        self.generator = generator
-
-    def _own_keys(self) -> list[NestedKey]:
-        # The last input is an action, the labelled one or another.
-        return list(self.network.in_keys)[:-1]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of labelled actions against randomly different ones."""
         self._require(tensordict)
         action = self._actions(tensordict)
-        both = torch.cat([action, self._different(action)], -1)
+        step = torch.randint(1, self.n_actions, action.shape, device=action.device)
+        both = torch.cat([action, (action + step) % self.n_actions], -1)
         with self._mode():
             right, wrong = self._scores(tensordict, both).unbind(-1)
-        halves = F.softplus(-right), F.softplus(wrong)
-        return self._losses(*halves, right, wrong, tensordict, tensordict)
+        return self._losses(right, wrong, tensordict, tensordict)
 
     def adversarial(
         self, demonstrations: TensorDictBase, policy: TensorDictBase, smoothing: float = 0.1
@@ -100,42 +77,30 @@ class RewardLoss(SupervisedLoss):
         with self._mode():
             right = self._scores(demonstrations, self._actions(demonstrations)).squeeze(-1)
             wrong = self._scores(policy, self._actions(policy)).squeeze(-1)
-        positive = F.binary_cross_entropy_with_logits(
-            right, torch.full_like(right, 1 - smoothing), reduction="none"
-        )
-        negative = F.binary_cross_entropy_with_logits(
-            wrong, torch.full_like(wrong, smoothing), reduction="none"
-        )
-        return self._losses(positive, negative, right, wrong, demonstrations, policy)
+        return self._losses(right, wrong, demonstrations, policy, smoothing)
 
     def _losses(
         self,
-        positive: Tensor,
-        negative: Tensor,
         right: Tensor,
         wrong: Tensor,
         labelled: TensorDictBase,
         others: TensorDictBase,
+        smoothing: float = 0.0,
     ) -> TensorDict:
         """Reduce both halves, each over the samples that the mask of its batch leaves."""
-        halves = self._reduce_loss(positive, labelled), self._reduce_loss(negative, others)
-        return scalars(
-            loss_reward=(halves[0] + halves[1]) / 2,
-            positive_probability=self._mean(right.sigmoid(), labelled),
-            negative_probability=self._mean(wrong.sigmoid(), others),
+        positive = self._reduce_loss(F.softplus(-right) + smoothing * right, labelled)
+        negative = self._reduce_loss(F.softplus(wrong) - smoothing * wrong, others)
+        return TensorDict(
+            {
+                "loss_reward": (positive + negative) / 2,
+                "positive_probability": self._mean(right.sigmoid(), labelled),
+                "negative_probability": self._mean(wrong.sigmoid(), others),
+            }
         )
 
     def _actions(self, tensordict: TensorDictBase) -> Tensor:
         """Return the labelled actions [*B, 1]."""
         return tensordict.get(self.tensor_keys.action).unsqueeze(-1)
-
-    def _different(self, action: Tensor) -> Tensor:
-        """Draw another action than ``action`` [*B], uniform among the others."""
-        device = action.device if self.generator is None else self.generator.device
-        step = torch.randint(
-            1, self.n_actions, action.shape, generator=self.generator, device=device
-        )
-        return (action + step.to(action.device)) % self.n_actions
 
     def _scores(self, tensordict: TensorDictBase, actions: Tensor) -> Tensor:
         """Score several actions [*B, K] of each state: logits [*B, K]."""

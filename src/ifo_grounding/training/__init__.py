@@ -1,12 +1,10 @@
 """The supervised loop and the self-examination loop that the recipes share."""
 
 from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
-from ifo_grounding.training.best_checkpoint import BestCheckpoint
 from ifo_grounding.training.checkpoint import Checkpoint
-from ifo_grounding.training.early_stopping import EarlyStopping
-from ifo_grounding.training.held_out_accuracy import HeldOutAccuracy
 from ifo_grounding.training.pairs import select_pairs
 from ifo_grounding.training.run import Run, Stage
+from ifo_grounding.training.selection import BestCheckpoint, EarlyStopping, HeldOutAccuracy
 from ifo_grounding.training.self_examination import SelfExaminationConfig, self_examine
 from ifo_grounding.training.supervised import FitConfig, fit
 from ifo_grounding.training.trials import Trial, successive_halving, trial_seed

@@ -13,17 +13,15 @@ from ifo_grounding.errors import check_range
 from ifo_grounding.modules import beside
 from ifo_grounding.objectives import ImitationLoss, RewardLoss
 from ifo_grounding.training.loop import Metrics
-from ifo_grounding.training.updates import make_optimizer, update
+from ifo_grounding.training.updates import make_optimizer, means, update
 
 
 @dataclass
 class AuxiliaryImitation:
     """Adds the imitation loss to every gradient step of the policy.
 
-    Self-examination covers the instructions that the instruction classifier is sure of;
-    demonstrations cover the others too. Without them the policy forgets what it does not explore
-    (Rajeswaran et al. 2018, who mix demonstrations into policy gradients). An extension of the
-    paper.
+    Demonstrations cover also the instructions that the instruction classifier is not sure of, which
+    the policy would forget (Rajeswaran et al. 2018). An extension of the paper.
     """
 
     loss: ImitationLoss
@@ -36,7 +34,6 @@ class AuxiliaryImitation:
     """Labelled steps per gradient step."""
 
     def __post_init__(self) -> None:
-        """Refuse weights and batches that cannot be."""
         check_range(self, "weight", above=0)
         check_range(self, "batch_size", least=1)
 
@@ -73,12 +70,10 @@ class AdversarialUpdates:
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Train on the policy's steps [N, T] and return mean metrics, named ``reward/...``."""
-        policy_steps = batch.reshape(-1)
-        totals: dict[str, float] = {}
+        policy_steps, updates = batch.reshape(-1), []
         for _ in range(self.steps):
             rows = torch.randint(len(policy_steps), (self.batch_size,))
             shown = beside(self.demonstrations.sample(self.batch_size), self.loss)
             losses = self.loss.adversarial(shown, policy_steps[rows])
-            for key, value in update(losses, self.optimizer, grad_clip=1.0).items():
-                totals[key] = totals.get(key, 0.0) + float(value) / self.steps
-        return {f"reward/{key}": value for key, value in totals.items()}
+            updates.append(update(losses, self.optimizer, grad_clip=1.0))
+        return {f"reward/{key}": value for key, value in means(updates).items()}

@@ -1,8 +1,7 @@
 """Checkpoints that a killed run continues from to the same result.
 
-Both training loops draw all their randomness from ``derive(seed, name, iteration)``, so that a
-checkpoint at an iteration's end needs no generator states beyond the weights, the optimizer and
-the counters: they are functions of what it holds.
+Both training loops draw all their randomness from ``derive(seed, name, iteration)``: a checkpoint
+at an iteration's end holds no generator states.
 """
 
 from __future__ import annotations
@@ -26,13 +25,10 @@ FORMAT = "ifo-grounding checkpoint 2"
 def difference(
     made: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = ()
 ) -> str | None:
-    """Return how settings differ from those that something was made with, None where they do not.
+    """Return how nested settings differ from those that something was made with, None if not.
 
-    Args:
-        made: nested settings of before.
-        asked: those of now.
-        free: dotted names, of settings or of whole sections, that may differ. A name that only one
-            side has may be missing on the other where its value is None.
+    ``free`` names settings or whole sections, with dots, that may differ. A setting that only one
+    side has may be missing on the other where its value is None.
 
     >>> difference({"imitate": {"steps": 900}}, {"imitate": {"steps": 10}})
     'made with imitate.steps=900, not 10: leave it out'
@@ -141,22 +137,21 @@ class Checkpoint:
         return content["progress"]
 
 
-def spent(path: str | Path) -> float:
+def spent(path: Path) -> float:
     """Return the seconds of work that a checkpoint holds, 0 where it cannot be read."""
     try:
-        return float(_read(Path(path), whole=False)["seconds"])
+        return float(_read(path)["seconds"])
     except UserError:  # whoever continues from it says what is wrong
         return 0.0
 
 
-def _read(path: Path, whole: bool = True) -> dict[str, Any]:
-    """Return what a checkpoint file holds; ``whole`` compares all of it with its checksums."""
+def _read(path: Path) -> dict[str, Any]:
+    """Return what a checkpoint file holds."""
     try:
-        if whole:  # PyTorch does not compare them
-            with zipfile.ZipFile(path) as archive:
-                if damaged := archive.testzip():
-                    raise zipfile.BadZipFile(f"the checksum of {damaged} is another")
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=not whole)
+        with zipfile.ZipFile(path) as archive:  # PyTorch does not compare its checksums
+            if damaged := archive.testzip():
+                raise zipfile.BadZipFile(f"the checksum of {damaged} is another")
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # flipped bits raise whatever the reader stumbles over
         raise UserError(f"{path} is damaged ({_reason(error)}): delete it to start over") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:

@@ -18,13 +18,7 @@ Log = Callable[[Metrics, int], None]
 class Loop:
     """Iterations of a training loop, which go on from a checkpoint and end in one.
 
-    Args:
-        name: of the progress bar, and in errors.
-        iterations: how many there are, or after how many to pause.
-        saved: checkpoint to go on from and to save to, if any.
-        seconds: least time between two checkpoints.
-        log: gets the metrics of each iteration and the step.
-        progress: whether to show a progress bar.
+    There are ``iterations``, also if some are done. At least ``seconds`` pass between two saves.
     """
 
     def __init__(
@@ -50,7 +44,7 @@ class Loop:
         with tqdm(total=end, initial=first, desc=self.name, disable=off, leave=False) as bar:
             for iteration in range(first, end):
                 yield iteration
-                bar.set_postfix(_brief(self.history[-1]), refresh=False)
+                bar.set_postfix(_shown(self.history[-1]), refresh=False)
                 bar.update()
 
     def add(self, metrics: Metrics, step: int) -> None:
@@ -75,8 +69,7 @@ class Loop:
             self._last_save = time.monotonic()
 
 
-def _brief(metrics: Metrics) -> dict[str, str]:
+def _shown(metrics: Metrics) -> dict[str, str]:
     """Return the metrics that a progress bar shows."""
-    told = ("loss", "accuracy", "success", "learned_return")
-    shown = [key for key in metrics if key.startswith(told)]
-    return {key.removeprefix("loss_"): f"{metrics[key]:.3f}" for key in shown[:3]}
+    shown = [key for key in metrics if key.startswith(("loss", "accuracy", "learned_return"))]
+    return {key: f"{metrics[key]:.3f}" for key in shown[:3]}

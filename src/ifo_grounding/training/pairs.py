@@ -101,23 +101,12 @@ def select_pairs(
                     "pairs: lower threshold, raise candidates, or train the classifier, or the "
                     "policy that it was initialised from, longer"
                 )
-            found.append(_pairs(env.scene_numbers.flatten(), pixels, choices, scorer.pool, rows))
+            pairs = {
+                SCENE: env.scene_numbers.flatten()[rows].unsqueeze(-1),
+                INSTRUCTION: scorer.pool.to(rows.device)[choices.chosen[rows]],
+                SCORE: choices.score[rows].unsqueeze(-1),
+                FRAME_HASH: frame_hash(pixels[rows]).unsqueeze(-1),
+            }
+            found.append(TensorDict(pairs, [len(rows)]).cpu())
             bar.update(len(rows))
     return torch.cat(found)
-
-
-def _pairs(
-    scenes: Tensor,
-    pixels: Tensor,
-    choices: tuple[Tensor, Tensor],
-    pool: Tensor,
-    rows: Tensor,
-) -> TensorDict:
-    index, score = choices
-    entries = {
-        SCENE: scenes[rows].unsqueeze(-1),
-        INSTRUCTION: pool.to(index.device)[index[rows]],
-        SCORE: score[rows].unsqueeze(-1),
-        FRAME_HASH: frame_hash(pixels[rows]).unsqueeze(-1),
-    }
-    return TensorDict(entries, batch_size=[len(rows)]).cpu()

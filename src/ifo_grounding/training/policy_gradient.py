@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
@@ -18,7 +17,7 @@ from ifo_grounding import keys
 from ifo_grounding.modules import output_key
 from ifo_grounding.training.auxiliary import AuxiliaryImitation
 from ifo_grounding.training.loop import Metrics
-from ifo_grounding.training.updates import make_optimizer, update
+from ifo_grounding.training.updates import make_optimizer, means, update
 
 if TYPE_CHECKING:
     from ifo_grounding.training.self_examination import SelfExaminationConfig
@@ -39,8 +38,17 @@ class Learner:
         imitation: AuxiliaryImitation | None = None,
     ) -> None:
         self.config, self.policy, self.value, self.imitation = config, policy, value, imitation
-        self.collector = _make_collector(env, policy, config.steps)
-        self.batches: Iterator[TensorDictBase] | None = None
+        self.collector = Collector(  # on a CPU a round is written over the one before
+            env,
+            policy,
+            frames_per_batch=env.batch_size.numel() * config.steps,
+            total_frames=-1,
+            reset_at_each_iter=True,
+            trust_policy=True,
+            auto_register_policy_transforms=False,
+            return_same_td=env.device is not None and env.device.type == "cpu",
+        )
+        self.batches: Iterator[TensorDictBase] = iter(self.collector)
         self.advantage = GAE(
             gamma=config.gamma,
             lmbda=config.lmbda,
@@ -53,16 +61,12 @@ class Learner:
         for part in (self.advantage, self.loss):
             part.set_keys(reward=keys.LEARNED_REWARD, value=worth)
         critic = {id(p) for p in value.parameters()}
-        self.optimizer = make_optimizer(
-            (p for p in policy.parameters() if id(p) not in critic), 1.0
-        )
-        self.optimizer.param_groups[0]["lr"] = config.lr
-        self.optimizer.add_param_group({"params": list(value.parameters()), "lr": config.value_lr})
+        actor = [p for p in policy.parameters() if id(p) not in critic]
+        self.optimizer = make_optimizer(actor, config.lr)
+        self.optimizer.add_param_group({"params": list(value.parameters())})
 
     def collect(self) -> TensorDictBase:
         """Roll out the policy from a reset, [N, T], without the simulator's own reward."""
-        if self.batches is None:
-            self.batches = iter(self.collector)
         return next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
 
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
@@ -77,38 +81,14 @@ class Learner:
         # What comes next is in the advantage already; copying its images would cost a tenth.
         steps = batch.exclude(keys.NEXT, keys.INITIAL_PIXELS).reshape(-1)
         epochs = config.epochs if config.algorithm == "ppo" else 1
-        sums: dict[str, Tensor] = {}
-        updates = 0
+        updates = []
         for _ in range(epochs):
             for rows in torch.randperm(len(steps)).split(config.minibatch):
                 losses = self.loss(steps[rows])
                 if self.imitation:
                     losses["loss_imitation"] = self.imitation()
-                for key, scalar in update(losses, self.optimizer, config.grad_clip).items():
-                    sums[key] = sums.get(key, torch.zeros(())) + scalar.cpu()
-                updates += 1
-        return {key: float(total) / updates for key, total in sums.items()}
-
-    def close(self) -> None:
-        """Let go of the collector, and leave the env open for its owner."""
-        self.collector.shutdown(close_env=False)
-
-
-def _make_collector(env: EnvBase, policy: TensorDictModuleBase, steps: int) -> Collector:
-    """Return a collector of ``steps`` steps of each world per round, each from a reset.
-
-    On a CPU a round is written over the one before: keep copies of what has to last.
-    """
-    return Collector(
-        env,
-        policy,
-        frames_per_batch=env.batch_size.numel() * steps,
-        total_frames=-1,
-        reset_at_each_iter=True,
-        trust_policy=True,
-        auto_register_policy_transforms=False,
-        return_same_td=env.device is not None and env.device.type == "cpu",
-    )
+                updates.append(update(losses, self.optimizer, config.grad_clip))
+        return means(updates)
 
 
 def _make_loss(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import fcntl
 import importlib.util
 import os
@@ -11,7 +10,7 @@ import platform
 import shutil
 import time
 import uuid
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ class Run:
 
     Args:
         name: name of the run under the home folder (see :func:`ifo_grounding.files.home`), or a
-            path to a folder anywhere, such as ``./name``.
+            path to a folder, such as ``./name``.
         logger: ``csv``, ``tensorboard``, ``wandb`` or ``none``: where metrics go while training.
 
     Raises:
@@ -44,7 +43,7 @@ class Run:
 
     >>> import tempfile
     >>> run = Run(tempfile.mkdtemp())
-    >>> options = run.begin({"count": {"to": 3}})
+    >>> run.begin({"count": {"to": 3}})
     >>> run.stage("count").finish({"counted": 3})
     {'counted': 3}
     >>> run.stage("count").result
@@ -72,10 +71,9 @@ class Run:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other processes out of the run while the block lasts; the lock dies with this one.
+        """Keep other processes out of the run while the block lasts, and remove unfinished files.
 
-        The process that holds the lock may take it again. Files that a killed process was writing
-        are removed.
+        The lock dies with this process, which may take it again.
 
         Raises:
             UserError: where another process holds the lock, with its number, machine and time.
@@ -109,27 +107,22 @@ class Run:
         if not path.exists():
             return None
         from omegaconf import OmegaConf
-        from omegaconf.errors import OmegaConfBaseException
-        from yaml import YAMLError
 
         try:
             options = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
             if isinstance(options, dict):
                 return {str(name): value for name, value in options.items()}
             why = "it holds no options"
-        except (OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
+        except Exception as error:  # of YAML, of OmegaConf, of the file
             why = str(error).splitlines()[0]
         raise UserError(f"{path} is damaged ({why}): restore it, or give another run=")
 
-    def begin(self, options: dict[str, Any], free: Collection[str] = ()) -> dict[str, Any]:
+    def begin(self, options: dict[str, Any], free: Collection[str] = ()) -> None:
         """Write the options of a new run, or make sure that a run goes on with those it has.
 
         Args:
             options: nested dicts of numbers, strings, booleans, None and lists.
             free: dotted names, of options or of whole sections, that may differ from before.
-
-        Returns:
-            ``options``.
 
         Raises:
             UserError: where the run was made with another value, or its file is damaged.
@@ -142,7 +135,6 @@ class Run:
                 OmegaConf.save(OmegaConf.create(options), temporary)
         elif found := difference(made, options, free):
             raise UserError(f"the run {self.name} was {found}, or give another run=")
-        return options
 
     def stage(self, name: str) -> Stage:
         """Return a stage of the run."""
@@ -169,31 +161,23 @@ class Run:
             raise UserError(f"{path} is missing: run the recipe {recipe} with the same run first")
         return path
 
-    @property
-    def begun(self) -> bool:
-        """Whether it has options, or any stage was done or has left a checkpoint."""
-        left = (OPTIONS, "stages/*.json", "checkpoints/*.pt")
-        return any(any(self.folder.glob(kind)) for kind in left)
-
     def take_over(self, other: Run, without: Sequence[str] = ()) -> None:
-        """Copy what another run has made, but for its options, unless this one has begun.
+        """Copy what another run has finished, but for its options, unless this one has begun.
 
-        What the other run has finished counts as done here. A phase 2 can so be repeated with
-        other options, from the same phase 1.
+        A phase 2 can so be repeated with other options, from the same phase 1.
 
         Args:
             other: the run to copy.
             without: names of stages and files that this run is to make anew.
 
         Raises:
-            UserError: where the other run does not exist, or this one's folder holds what is no
-                run's.
+            UserError: where the other run does not exist, or this folder holds what is no run's.
         """
         taken = self / TAKEN
         if (self / OPTIONS).exists():
             return
         if not taken.exists():
-            if self.begun:  # it has taken over all, and was killed before its options were written
+            if (self / "stages").is_dir():  # all is taken over, but the options are not written
                 return
             if any(self.folder.glob("[!.]*")):
                 raise UserError(f"{self.folder} holds other files and no run: name another run")
@@ -217,15 +201,15 @@ class Stage:
 
     def __init__(self, run: Run, name: str) -> None:
         self.run, self.name = run, name
-        self.checkpoint = run / f"checkpoints/{name}.pt"
+        self.checkpoint = run / f"checkpoints/{name}/stage.pt"
         self.result: dict[str, Any] | None = run.record(name).get("result")
         if self.result is not None:
             self._drop_checkpoints()  # of a process that was killed just before it did
-        self._start = time.monotonic() - sum(map(spent, self._checkpoints()))
+        self._start = time.monotonic() - sum(map(spent, self.checkpoint.parent.glob("*.pt")))
 
     def trial(self, number: int) -> Path:
         """Return the file for the checkpoint of one of several initial weights."""
-        return self.checkpoint.with_stem(f"{self.name}-{number}")
+        return self.checkpoint.with_stem(f"trial-{number}")
 
     def finish(
         self,
@@ -251,65 +235,34 @@ class Stage:
         return result
 
     def log(self) -> Log | None:
-        """Return a function that sends metrics to the run's TorchRL logger.
+        """Return a function that sends metrics to the run's TorchRL logger, None where it has none.
 
-        A continued run repeats the steps since its checkpoint exactly. In ``csv`` and
-        ``tensorboard`` files those that are logged already are not logged again; ``wandb`` gets
-        them twice, in the one run there that belongs to this folder.
+        A continued run repeats the steps since its checkpoint, which are not logged again.
         """
         if self.run.logger == "none":
             return None
         from torchrl.record.loggers import get_logger
 
         folder, options, name = self.run / "logs", {}, self.name
-        if self.run.logger == "wandb":
-            options = {"wandb_kwargs": {"project": "ifo-grounding", "id": _wandb_id(folder)}}
+        if self.run.logger == "wandb":  # one run there for all stages of this folder
+            if not (drawn := folder / "wandb-id.json").exists():
+                write_json(drawn, uuid.uuid4().hex[:8])
+            options = {"wandb_kwargs": {"project": "ifo-grounding", "id": read_json(drawn)}}
             name = self.run.folder.resolve().name
-        logged = _last_steps(folder / self.name, self.run.logger)
         logger: Any = get_logger(self.run.logger, str(folder), name, **options)
+        mark = folder / f"{self.name}-step.json"
+        last = read_json(mark) if mark.exists() else -1
 
         def log(metrics: Metrics, step: int) -> None:
+            if step <= last:
+                return
             for key, value in metrics.items():
-                if step > logged.get(full := f"{self.name}/{key}", -1):
-                    logger.log_scalar(full, value, step=step)
+                logger.log_scalar(f"{self.name}/{key}", value, step=step)
             if self.run.logger == "tensorboard":
                 logger.experiment.flush()  # before the checkpoint that these steps are in
+            write_json(mark, step)
 
         return log
 
-    def _checkpoints(self) -> list[Path]:
-        """Return its checkpoint and those of its trials, as far as they are there."""
-        trials = self.checkpoint.parent.glob(f"{self.name}-*.pt")
-        numbered = [path for path in trials if path.stem[len(self.name) + 1 :].isdigit()]
-        return [path for path in (self.checkpoint, *sorted(numbered)) if path.exists()]
-
     def _drop_checkpoints(self) -> None:
-        for path in self._checkpoints():
-            path.unlink(missing_ok=True)
-
-
-def _wandb_id(folder: Path) -> str:
-    """Return by which id Weights and Biases goes on with a run, drawn once per folder."""
-    path = folder / "wandb-id"
-    if not path.exists():
-        with atomic_write(path) as temporary:
-            temporary.write_text(uuid.uuid4().hex[:8])
-    return path.read_text()
-
-
-def _last_steps(folder: Path, logger: str) -> Mapping[str, int]:
-    """Return the last step that a stage has logged of each metric, from the files in ``folder``."""
-    last: dict[str, int] = {}
-    if logger == "csv":
-        scalars = folder / "scalars"
-        for path in scalars.rglob("*.csv"):
-            with path.open(newline="") as file:
-                steps = [int(float(row[0])) for row in csv.reader(file) if row]
-            last[str(path.relative_to(scalars).with_suffix(""))] = max(steps, default=-1)
-    elif logger == "tensorboard" and folder.is_dir():
-        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-        events = EventAccumulator(str(folder), size_guidance={"scalars": 1}).Reload()
-        for key in events.Tags()["scalars"]:
-            last[key] = events.Scalars(key)[-1].step
-    return last
+        shutil.rmtree(self.checkpoint.parent, ignore_errors=True)

@@ -10,24 +10,19 @@ from typing import Any
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.allocation import release_freed_memory
+from ifo_grounding.attributes import first_worker, untransformed
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
-from ifo_grounding.training.best_checkpoint import BestCheckpoint
 from ifo_grounding.training.checkpoint import Checkpoint
-from ifo_grounding.training.held_out_accuracy import HeldOutAccuracy
 from ifo_grounding.training.loop import Log, Loop, Metrics
 from ifo_grounding.training.policy_gradient import Learner
-from ifo_grounding.training.reseeding import (
-    fixes_scenes,
-    reseed,
-    sampler_stats,
-    transforms_of,
-    workers_fix_scenes,
-)
+from ifo_grounding.training.reseeding import reseed, sampler_stats, stored_starts
+from ifo_grounding.training.selection import BestCheckpoint, HeldOutAccuracy
 from ifo_grounding.transforms.base import exposes_state, instructs
 
 ALGORITHMS = ("ppo", "reinforce")
@@ -81,7 +76,6 @@ class SelfExaminationConfig:
     """Iterations between two calls of the callback; 0 calls it at the end only."""
 
     def __post_init__(self) -> None:
-        """Refuse unknown algorithms and values out of range."""
         check_numbers(self, unbounded=["grad_clip", "select_margin"])
         check_choice("algorithm", self.algorithm, ALGORITHMS)
         check_range(self, "iterations", "steps", "epochs", "minibatch", least=1)
@@ -122,15 +116,14 @@ def self_examine(
         policy: the phase-1 policy, a ``ProbabilisticActor``.
         value: estimates the learned return.
         config: algorithm and budget.
-        seed: all randomness is a function of it and of the iteration, and every iteration starts
-            from a reset: a run continues from its checkpoint to the same result.
+        seed: all randomness is a function of it and of the iteration, which starts from a reset.
         adversarial: trains the reward model on, with the steps of each iteration.
         imitation: imitates the demonstrations on.
-        held_out: keeps policies from being selected that are clearly less accurate on held-out
-            demonstrations than phase 1. With ``adversarial`` the most accurate policy is the best.
-        checkpoint: file to continue from and to save to.
+        held_out: policies that are clearly less accurate there than phase 1 are not selected. With
+            ``adversarial`` the most accurate policy is the best.
+        checkpoint: file to continue from, to the same result, and to save to.
         checkpoint_seconds: least time between two checkpoints.
-        log: gets the metrics of each iteration.
+        log: gets the metrics of each iteration and its number.
         callback: gets the iteration, returns further metrics; the place for audits.
         progress: whether to show a progress bar.
 
@@ -157,13 +150,17 @@ def self_examine(
     )
     learner = Learner(env, policy, value, config, imitation)
     sampler_stats(env)  # forgets the reset that a collector begins with
-    parts = _parts(env, learner, best, adversarial)
+    parts: dict[str, Any] = {"policy": policy, "value": value}
+    parts |= {"optimizer": learner.optimizer, "best": best}
+    if adversarial is not None:
+        parts |= {"reward": adversarial.loss, "reward optimizer": adversarial.optimizer}
+    parts |= {f"starts {number}": starts for number, starts in enumerate(stored_starts(env))}
     settings = {**asdict(config), "seed": seed, "worlds": env.batch_size.numel()}
     saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
     loop = Loop(NAME, config.iterations, saved, checkpoint_seconds, log, progress)
     every = config.select_every
     if every and not loop.history:
-        best.consider()
+        best.measure()
     for iteration in loop:
         reseed(env, derive(seed, NAME, iteration))
         batch = learner.collect()
@@ -173,15 +170,16 @@ def self_examine(
         release_freed_memory()  # batches of distinct pictures differ in size and would pile up
         if adversarial:
             metrics |= adversarial(batch)
-        done, last = iteration + 1, iteration + 1 == config.iterations
+        done = iteration + 1
+        last = done == config.iterations
         if every and (last or done % every == 0):
-            metrics |= best.consider()
+            metrics |= best.measure()
         if last:
             best.restore()
         if callback and (last or (config.evaluate_every and done % config.evaluate_every == 0)):
             metrics |= {name: float(number) for name, number in callback(done).items()}
         loop.add(metrics, done)
-    learner.close()
+    learner.collector.shutdown(close_env=False)  # the env is its owner's
     return loop.history
 
 
@@ -202,7 +200,8 @@ def _check(
     written = [*env.full_reward_spec.keys(True, True), *observed]
     if keys.LEARNED_REWARD not in written:
         raise UserError("the env pays no learned reward: add LearnedReward or GoalReward")
-    if workers_fix_scenes(env):
+    workers = untransformed(env)
+    if isinstance(workers, BatchedEnvBase) and stored_starts(first_worker(workers)):
         raise UserError(
             "StartingPairs inside a worker cannot be seeded or gone back to: do without workers; "
             "more rows (num_envs) are faster"
@@ -213,21 +212,6 @@ def _check(
             "from one iteration to the next: give held_out=, by whose accuracy the best policy is "
             "selected, or set select_every=0 to keep the last"
         )
-
-
-def _parts(
-    env: EnvBase,
-    learner: Learner,
-    best: BestCheckpoint,
-    adversarial: AdversarialUpdates | None,
-) -> dict[str, Any]:
-    """Return what a checkpoint has to keep."""
-    parts: dict[str, Any] = {"policy": learner.policy, "value": learner.value}
-    parts |= {"optimizer": learner.optimizer, "best": best}
-    if adversarial is not None:
-        parts |= {"reward": adversarial.loss, "reward optimizer": adversarial.optimizer}
-    starts = [transform for transform in transforms_of(env) if fixes_scenes(transform)]
-    return parts | {f"starts {number}": transform for number, transform in enumerate(starts)}
 
 
 def summary(batch: TensorDictBase) -> Metrics:

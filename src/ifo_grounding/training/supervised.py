@@ -17,14 +17,15 @@ from ifo_grounding.errors import UserError, check_choice, check_numbers, check_r
 from ifo_grounding.modules import beside, device_of
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.checkpoint import Checkpoint
-from ifo_grounding.training.early_stopping import BestWeights
 from ifo_grounding.training.loop import Log, Loop, Metrics
+from ifo_grounding.training.selection import BestWeights
 from ifo_grounding.training.updates import (
     CapturedUpdate,
     Update,
     decay_towards_origin,
     let_capture,
     make_optimizer,
+    means,
     set_rate,
     update,
 )
@@ -61,7 +62,6 @@ class FitConfig:
     """Iterations between two measures of ``held_out``, where there is one."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown schedule and values out of range."""
         check_numbers(self, unbounded=["grad_clip"])
         check_choice("schedule", self.schedule, SCHEDULES)
         check_range(self, "steps", "batch_size", "iteration", "validate_every", least=1)
@@ -110,11 +110,10 @@ def fit(
         buffer: ``sample(batch_size)`` gives the loss its input; ``len`` of it decides how much
             ``config.prior`` counts.
         config: steps, batch size, learning rate.
-        seed: all randomness is a function of it, of ``name`` and of the iteration. A buffer that
-            prefetches, and generators given to the loss or the buffer, do not continue from a
-            checkpoint to the same result.
+        seed: all randomness is a function of it, of ``name`` and of the iteration.
         name: names the stream of randomness, and the progress bar.
-        checkpoint: file to continue from and to save to.
+        checkpoint: file to continue from, to the same result, and to save to; not with a buffer
+            that prefetches or has a generator of its own.
         checkpoint_seconds: least time between two checkpoints.
         log: gets the mean metrics of each iteration and the step.
         held_out: an :class:`~ifo_grounding.training.EarlyStopping` or a
@@ -155,9 +154,8 @@ def fit(
     pause_at = iterations if until is None else min(math.ceil(until / config.iteration), iterations)
     saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
     loop = Loop(name, pause_at, saved, checkpoint_seconds, log, progress)
-    same_steps = getattr(loss, "capturable", False) and not decay
-    same_sizes = isinstance(sampler, RandomSampler)
-    captured = cudagraph and device.type == "cuda" and same_steps and same_sizes
+    same_steps = getattr(loss, "capturable", False) and isinstance(sampler, RandomSampler)
+    captured = cudagraph and device.type == "cuda" and same_steps and not decay
     let_capture(optimizer, captured)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
@@ -172,7 +170,7 @@ def fit(
         done = iteration + 1
         if held_out:
             if done % config.validate_every == 0 or done == iterations:
-                metrics[held_out.metric] = held_out.measure()
+                metrics |= held_out.measure()
             if done == iterations:
                 held_out.restore()
         loop.add(metrics, steps.stop)
@@ -187,15 +185,13 @@ def _iterate(
     steps: range,
     make_step: Update,
 ) -> Metrics:
-    sums: dict[str, Tensor] = {}
+    updates: list[dict[str, Tensor]] = []
     start = time.perf_counter()
     for step in steps:
         if callable(set_progress := getattr(loss, "set_progress", None)):
             set_progress(step / config.steps)
         set_rate(optimizer, config.lr * config.rate(step))
-        batch = beside(buffer.sample(config.batch_size), loss)
-        for key, value in make_step(batch).items():  # summed where it lies: a GPU is not waited for
-            sums[key] = sums[key] + value if key in sums else value.clone()
-    means = {key: float(value) / len(steps) for key, value in sums.items()}
+        updates.append(make_step(beside(buffer.sample(config.batch_size), loss)))
+    found = means(updates)  # read once: a GPU is not waited for after each step
     speed = len(steps) * config.batch_size / (time.perf_counter() - start)
-    return {"step": float(steps.stop), **means, "samples_per_second": speed}
+    return {"step": float(steps.stop), **found, "samples_per_second": speed}

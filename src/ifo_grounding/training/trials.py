@@ -58,11 +58,7 @@ class Trial:
         return self.tried[-1][self.loss.out_keys[0]]
 
     def finish(self, log: Log | None = None) -> list[Metrics]:
-        """Learn on to the end, and return the metrics of all iterations.
-
-        Args:
-            log: gets the metrics of what was tried first, and then those of each iteration.
-        """
+        """Learn on to the end, log what was tried first, too, and return all metrics."""
         if log is not None:
             for metrics in self.tried:
                 log(metrics, int(metrics["step"]))
@@ -73,7 +69,7 @@ def successive_halving(trials: Sequence[Trial], steps: int, halvings: int = 0) -
     """Return the trial with the lowest loss (successive halving, Jamieson and Talwalkar 2016).
 
     All trials learn for ``steps``; the better half then learns on for as many again, ``halvings``
-    times. Each goes on from its checkpoint: interrupted trials end in the same choice.
+    times. Interrupted trials end in the same choice.
     """
     for times in range(1, halvings + 2):
         if len(trials) == 1:

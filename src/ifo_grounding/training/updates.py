@@ -58,19 +58,20 @@ def update(
     return {**scalars, "grad_norm": norm.detach()}
 
 
+def means(updates: list[dict[str, Tensor]]) -> dict[str, float]:
+    """Return the mean of each metric over some updates."""
+    return {key: float(torch.stack([each[key] for each in updates]).mean()) for key in updates[0]}
+
+
 class CapturedUpdate:
     """Makes the same update of batch after batch, from the fourth on as one CUDA graph.
 
-    A small network's step is hundreds of kernels of some microseconds each, and Python launches
-    them more slowly than a GPU computes them. ``tensordict.nn.CudaGraphModule`` captures a step
-    too, but synchronises with the GPU at every call.
+    Python launches the hundreds of kernels of a small network's step more slowly than a GPU
+    computes them. ``tensordict.nn.CudaGraphModule`` synchronises with the GPU at every call.
 
     Args:
-        update: maps a batch to metrics. It launches the same kernels whatever the batch holds,
-            reads no tensor back to the CPU, and steps an optimizer prepared by
-            :func:`let_capture`.
-
-    The next call overwrites the metrics that a call returned.
+        update: maps a batch to metrics, by the same kernels whatever the batch holds, reads nothing
+            back to the CPU, and steps an optimizer prepared by :func:`let_capture`.
 
     Raises:
         UserError: where the update cannot be captured.
@@ -102,7 +103,7 @@ class CapturedUpdate:
         else:
             self.batch.update_(batch)
         self.graph.replay()
-        return self.metrics
+        return {key: value.clone() for key, value in self.metrics.items()}
 
     def _aside(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Make the update on a stream of its own, as what is captured later has to be."""
