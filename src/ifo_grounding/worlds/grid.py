@@ -62,31 +62,19 @@ class Grid(World):
         names = ("tile_size", "split", "holdout", "holdout_visible", "layout")
         return {**{name: getattr(self, name) for name in names}, **chosen}
 
-    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> PickAndPlaceEnv:
+    def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions and true rewards; see :class:`World`."""
-        options = self.scenes(seed=seed, device=device, instructed=False)
-        return PickAndPlaceEnv(self.task, num_envs, **options)
+        return PickAndPlaceEnv(self.task, num_envs, instructed=False, **self.scenes(**options))
 
     def instructed(
-        self,
-        num_envs: int,
-        *,
-        seed: int,
-        stream: str,
-        split: str = "all",
-        waits: bool = False,
-        device: str = "cpu",
+        self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
     ) -> PickAndPlaceEnv:
         """Return worlds with an instruction; a fulfilled one ends no episode."""
-        options = self.scenes(seed=seed, stream=stream, split=split, device=device)
-        return PickAndPlaceEnv(self.task, num_envs, **options)
+        return PickAndPlaceEnv(self.task, num_envs, **self.scenes(split=split, **options))
 
-    def demonstrate(
-        self, n: int, *, seed: int, stream: str = "training", progress: bool = False
-    ) -> tuple[Demonstrations, Truth | None]:
+    def demonstrate(self, n: int, **options: Any) -> tuple[Demonstrations, Truth | None]:
         """Record the expert."""
-        options = self.scenes(seed=seed, stream=stream, progress=progress)
-        return record_demonstrations(self.task, n, keep_truth=True, **options)
+        return record_demonstrations(self.task, n, keep_truth=True, **self.scenes(**options))
 
     def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
         """Return the expert's success: it never fails."""
