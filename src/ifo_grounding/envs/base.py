@@ -66,12 +66,13 @@ class NumberedEnv(EnvBase):
         self, tensordict: TensorDictBase | None, started: bool
     ) -> tuple[Tensor, Tensor | None]:
         """Return the rows that begin an episode, int64 [R], and the scenes asked for there."""
-        mask = None if tensordict is None else tensordict.get("_reset", None)
+        given: Any = {} if tensordict is None else tensordict
+        mask = given.get("_reset", None)
         if mask is None or not started:
             rows = torch.arange(self.num_envs, device=self.device)
         else:
             rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
-        numbers = None if tensordict is None else tensordict.get(keys.SCENE, None)
+        numbers = given.get(keys.SCENE, None)
         if numbers is None:
             return rows, None
         if numbers.is_floating_point() or numbers.dtype == torch.bool:

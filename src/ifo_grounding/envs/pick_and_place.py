@@ -155,8 +155,8 @@ class PickAndPlaceEnv(NumberedEnv):
         return Composite(parts, shape=self.batch_size, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        given = self._empty() if tensordict is None else tensordict
-        rows, numbers = self._asked(given, self._simulator.started)
+        given: Any = {} if tensordict is None else tensordict
+        rows, numbers = self._asked(tensordict, self._simulator.started)
         self._simulator.reset(rows, numbers)
         tokens = given.get(keys.INSTRUCTION, None) if self.instructed else None
         # The instruction of an observation is over.
@@ -213,11 +213,8 @@ class PickAndPlaceEnv(NumberedEnv):
                 "TensorDict of 'scene' (env.scene_numbers for the same scenes) and 'instruction'"
             )
 
-    def _empty(self) -> TensorDict:
-        return TensorDict({}, batch_size=self.batch_size, device=self.device)
-
     def _observe(self) -> TensorDict:
-        result = self._empty()
+        result = TensorDict({}, batch_size=self.batch_size, device=self.device)
         result[keys.PIXELS] = self._simulator.pixels()
         if self.instructed:
             result[keys.INSTRUCTION] = self._simulator.instruction.clone()

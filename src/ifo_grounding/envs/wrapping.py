@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.envs.base import DONE, NumberedEnv
@@ -183,19 +182,15 @@ class GymnasiumEnv(NumberedEnv):
         terminated = terminated | stopped
         if not self.instructed:
             reward, terminated, truncated = np.zeros_like(reward), stopped, done & ~stopped
-        result = self._observed(done=done, terminated=terminated, truncated=truncated)
-        return result.set(keys.REWARD, self._column(reward.astype(np.float32)))
+        flags = {"done": done, "terminated": terminated, "truncated": truncated}
+        return self._observed(reward=reward.astype(np.float32), **flags)
 
-    def _observed(self, **flags: np.ndarray) -> TensorDict:
-        result = TensorDict({}, batch_size=self.batch_size, device=self.device)
-        for name in self.observation_spec.keys():  # noqa: SIM118
-            result[name] = torch.from_numpy(self._seen[name]).to(self.device)
-        for name, flag in flags.items():
-            result[name] = self._column(flag)
-        return result
-
-    def _column(self, values: np.ndarray) -> Tensor:
-        return torch.from_numpy(values).to(self.device).unsqueeze(-1)
+    def _observed(self, **columns: np.ndarray) -> TensorDict:
+        """Return what is seen, with columns [num_envs] beside it."""
+        seen = {name: self._seen[name] for name in self.observation_spec.keys()}  # noqa: SIM118
+        seen.update({name: column[:, None] for name, column in columns.items()})
+        tensors = {name: torch.from_numpy(array) for name, array in seen.items()}
+        return TensorDict(tensors, batch_size=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = secrets.randbits(31) if seed is None else seed

@@ -55,7 +55,7 @@ class Grid(World):
         grammar(self.task)
         self.layout = Layout(self.size, (*self.objects,), (*self.boxes,), self.inside)
         self.actions, self.stop_action, self.vocabulary = keys.ACTIONS, keys.STOP, VOCABULARY
-        self.oracle = GridOracle(self)
+        self.oracle = self
 
     def scenes(self, **chosen: Any) -> dict[str, Any]:
         """Return the arguments that environments, recorder and oracle share."""
@@ -89,24 +89,17 @@ class Grid(World):
             raise UserError(f"{folder} is of another task: {error}; say task=...") from None
         return demos
 
-
-class GridOracle:
-    """Knows the truth of a :class:`Grid`."""
-
-    def __init__(self, world: Grid) -> None:
-        self.world = world
-
     def suitable_rate(self, classifier: Any, pool: Tensor, **options: Any) -> SuitabilityResult:
         """Check the instructions that a classifier chooses for fresh states."""
-        return suitable_rate(classifier, self.world.task, pool, **self.world.scenes(**options))
+        return suitable_rate(classifier, self.task, pool, **self.scenes(**options))
 
     def endings(self, policy: nn.Module, episodes: int, **scenes: Any) -> Endings:
         """Say how the policy's episodes end."""
-        options = self.world.scenes(episodes=episodes, **scenes)
-        return episode_endings(policy, self.world.task, **options)
+        options = self.scenes(episodes=episodes, **scenes)
+        return episode_endings(policy, self.task, **options)
 
     def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
         """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
         from ifo_grounding.report import instruction_cases  # draws: slow to import
 
-        return instruction_cases(classifier, self.world.task, pool, **self.world.scenes(**options))
+        return instruction_cases(classifier, self.task, pool, **self.scenes(**options))
