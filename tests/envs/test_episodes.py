@@ -77,15 +77,6 @@ def test_success_counts_when_time_runs_out(late):
     assert (after["reward"].squeeze(-1)[idles] == 1 - late).all()
 
 
-def test_the_paper_s_limit_is_the_default():
-    env = PickAndPlaceEnv("move", 2, seed=0)
-    walk = lambda td: td.set("action", torch.zeros(2, dtype=torch.int64))  # noqa: E731
-    rollout = env.rollout(100, walk)
-    assert rollout.shape == (2, 40)
-    assert rollout["next", "truncated"][:, -1].all()
-    assert not rollout["next", "done"][:, :-1].any()
-
-
 def test_partial_resets_touch_only_their_rows():
     env = PickAndPlaceEnv("pick", 6, seed=0, expose_state=True)
     td = env.reset()

@@ -5,6 +5,7 @@ import warnings
 
 import gymnasium
 import numpy as np
+import pygame
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
@@ -101,38 +102,37 @@ def test_options_reach_the_world():
 # --- pictures ------------------------------------------------------------------------------------
 
 
+def drawn(env) -> np.ndarray:
+    return render(env._worlds._simulator.state, 32)[0].permute(1, 2, 0).numpy()
+
+
 def test_rgb_array_is_drawn_large():
     env = gymnasium.make(NAMES["pick"], render_mode="rgb_array")
     env.reset(seed=0)
     frame = env.render()
     assert (frame.shape, frame.dtype) == ((192, 192, 3), np.uint8)
-    expected = render(env.unwrapped._simulator.state, 32)[0].permute(1, 2, 0).numpy()
-    assert np.array_equal(frame, expected)
-    before = frame.copy()
-    for action in (1, 2):
-        env.step(action)
-    assert not np.array_equal(env.render(), before)
+    assert np.array_equal(frame, drawn(env.unwrapped))
 
 
-def test_a_window_shows_the_world_and_the_instruction(monkeypatch):
-    import pygame
+def in_the_window() -> np.ndarray:
+    surface = pygame.display.get_surface()
+    return pygame.surfarray.array3d(surface).swapaxes(0, 1)
 
+
+def test_a_window_shows_the_world_and_the_instruction():
     env = PickAndPlaceGymEnv("pick", render_mode="human")
-    window = env._window
-    window.fps = 0  # do not wait
-    _, info = env.reset(seed=0)
+    env._window.fps = 0  # do not wait
     for seed in (0, 1):
         _, info = env.reset(seed=seed)
         assert pygame.display.get_caption()[0] == info["instruction_text"]
-        shown = window.pixels()
+        shown = in_the_window()
         assert shown.shape == (192 + LINE_HEIGHT, 192, 3)
-        world = render(env._simulator.state, 32)[0].permute(1, 2, 0).numpy()
-        assert np.array_equal(shown[:192], world)
+        assert np.array_equal(shown[:192], drawn(env))
         assert len(np.unique(shown[192:].reshape(-1, 3), axis=0)) > 10  # letters
-    before = window.pixels().copy()
     env.step(1)
     env.step(2)
-    assert not np.array_equal(window.pixels(), before)
+    assert np.array_equal(in_the_window()[:192], drawn(env))
+    assert not np.array_equal(in_the_window(), shown)
     assert env.render() is None
     env.close()
     assert not pygame.display.get_init()
@@ -149,7 +149,7 @@ def test_a_window_needs_no_screen(monkeypatch, driver):
             monkeypatch.delenv(name)
     env = PickAndPlaceGymEnv("move", render_mode="human")
     env.reset(seed=0)
-    assert env._window.pixels().any()
+    assert in_the_window().any()
     env.close()
 
 
@@ -197,13 +197,15 @@ def test_torchrl_wraps_many_worlds():
 # --- mistakes ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [PickAndPlaceGymEnv, PickAndPlaceVectorEnv])
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("kind", "wrong", "said"),
     [
-        ({"task": "fly"}, "unknown task 'fly'"),
-        ({"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
-        ({"render_mode": "ascii"}, "unknown render mode 'ascii'"),
+        (PickAndPlaceGymEnv, {"task": "fly"}, "unknown task 'fly'"),
+        (PickAndPlaceGymEnv, {"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
+        (PickAndPlaceGymEnv, {"render_mode": "ascii"}, "unknown render mode 'ascii'"),
+        (PickAndPlaceVectorEnv, {"render_mode": "human"}, "unknown render mode 'human'"),
+        (PickAndPlaceVectorEnv, {"num_envs": 0}, "num_envs must be at least 1"),
+        (PickAndPlaceVectorEnv, {"autoreset_mode": "x"}, "mode 'x': choose one of 'NextStep'"),
     ],
 )
 def test_bad_arguments_are_refused(kind, wrong, said):
@@ -211,19 +213,9 @@ def test_bad_arguments_are_refused(kind, wrong, said):
         kind(**wrong)
 
 
-@pytest.mark.parametrize("kind", [PickAndPlaceGymEnv, PickAndPlaceVectorEnv])
-def test_unknown_arguments_are_refused(kind):
+def test_unknown_arguments_are_refused():
     with pytest.raises(TypeError, match="argument 'instructed': scene options are holdout, "):
-        kind(instructed=False)
-
-
-def test_bad_vector_arguments_are_refused():
-    with pytest.raises(UserError, match="num_envs must be at least 1"):
-        PickAndPlaceVectorEnv(num_envs=0)
-    with pytest.raises(UserError, match="unknown autoreset mode 'x': choose one of 'NextStep'"):
-        PickAndPlaceVectorEnv(autoreset_mode="x")
-    with pytest.raises(UserError, match="unknown render mode 'human'"):
-        PickAndPlaceVectorEnv(render_mode="human")
+        PickAndPlaceGymEnv(instructed=False)
 
 
 def test_bad_calls_are_refused():

@@ -14,7 +14,7 @@ from ifo_grounding.envs import from_gymnasium
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, return_correlation, success_rate
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
-from ifo_grounding.transforms import GoalReward, InstructionSampler
+from ifo_grounding.transforms import GoalReward
 
 WORDS = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS], length=6)
 DIAL = {"vocabulary": WORDS, "image": "view", "instruction": "task"}
@@ -85,27 +85,6 @@ def test_scenes_have_numbers_and_streams_do_not_meet():
     assert not torch.equal(trained, evaluated)
 
 
-def test_partial_resets_touch_only_their_rows():
-    env = dials(4)
-    td = env.reset()
-    td = env.step_mdp(env.step(td.set("action", torch.tensor([0, 1, 0, 1]))))
-    mask = torch.tensor([[False], [True], [False], [True]])
-    after = env.reset(td.clone().set("_reset", mask))
-    kept = ~mask.squeeze(-1)
-    assert torch.equal(after["pixels"][kept], td["pixels"][kept])
-    assert torch.equal(after["instruction"][kept], td["instruction"][kept])
-    assert env.scene_numbers.tolist() == [0, 4, 2, 5]
-    again = env.step(after.set("action", torch.full((4,), PRESS)))
-    assert torch.equal(again["next", "pixels"], after["pixels"])  # pressing moves nothing
-
-
-@pytest.mark.parametrize("scene", [-1, 0.5])
-def test_what_is_no_number_of_a_scene_is_refused(scene):
-    env = dials(2)
-    with pytest.raises(UserError, match="scene"):
-        env.reset(TensorDict({"scene": torch.tensor([[0], [scene]])}, [2]))
-
-
 def test_a_learner_sees_neither_reward_nor_the_world_s_own_goal():
     env = dials(8, instructed=False, seed=1)
     rollout = env.rollout(60, break_when_any_done=False)
@@ -173,17 +152,6 @@ def test_words_that_nobody_taught_can_be_left_out():
         dials(6, vocabulary=known)
     read = known.decode(dials(6, vocabulary=known, skip_unknown=True).reset()["instruction"])
     assert "turn the dial to" in read and set(read) <= {"turn the dial to", "turn the dial to one"}
-
-
-def test_instructions_can_be_chosen_for_it():
-    def all_suit(pixels, instruction):
-        return torch.full((len(pixels), 1), 9.0)
-
-    classifier = TensorDictModule(all_suit, ["pixels", "instruction"], ["suitability"])
-    pool = WORDS.encode([f"turn the dial to {mark}" for mark in MARKS])
-    env = TransformedEnv(dials(3, instructed=False), InstructionSampler(classifier, pool))
-    check_env_specs(env)
-    assert all(text.startswith("turn") for text in WORDS.decode(env.reset()["instruction"]))
 
 
 class Odd(Dial):

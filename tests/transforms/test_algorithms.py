@@ -20,15 +20,7 @@ from ifo_grounding.networks import (
     make_reward_model,
 )
 from ifo_grounding.transforms import GoalReward, InstructionSampler, LearnedReward
-from transforms.counter_world import (
-    POOL,
-    STOP,
-    CounterWorld,
-    classifier,
-    goal_classifier,
-    reward_model,
-    shown,
-)
+from transforms.counter_world import STOP, goal_classifier, make, reward_model, shown
 
 
 class Features(nn.Module):
@@ -56,18 +48,6 @@ def actor_and_critic():
     return actor, TensorDictModule(Features(1), keys, ["state_value"])
 
 
-def make(reward, batch=(32,)):
-    sampler = InstructionSampler(classifier(), POOL)
-    return TransformedEnv(CounterWorld(batch, max_steps=12), Compose(sampler, reward))
-
-
-def rewards():
-    return {
-        "action": LearnedReward(reward_model()),
-        "goal": GoalReward(goal_classifier(), stop_action=STOP),
-    }
-
-
 def train(iterations):
     """Share of stops at the target, of all episodes, in the first and the last batch."""
     actor, critic = actor_and_critic()
@@ -79,7 +59,7 @@ def train(iterations):
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
     frames = 32 * 24
     collector = Collector(
-        make(rewards()["action"]),
+        make(LearnedReward(reward_model()), batch=(32,)),
         actor,
         frames_per_batch=frames,
         total_frames=frames * iterations,
@@ -114,7 +94,8 @@ def test_losses_read_the_learned_reward_only(loss_class):
     loss.set_keys(reward="learned_reward")
     loss.make_value_estimator(gamma=0.9, lmbda=0.9)
     with torch.no_grad():
-        rollout = make(rewards()["goal"]).rollout(20, actor, break_when_any_done=False)
+        env = make(GoalReward(goal_classifier(), STOP), batch=(32,))
+        rollout = env.rollout(20, actor, break_when_any_done=False)
     changed = rollout.clone()
     changed["next", "reward"] += 100.0
     repaid = rollout.clone()
@@ -126,22 +107,16 @@ def test_losses_read_the_learned_reward_only(loss_class):
     assert before == same != other
 
 
-def worker(kind="goal"):
-    return make(rewards()[kind], (4,))
+def worker():
+    return make(LearnedReward(reward_model()), batch=(4,))
 
 
 @pytest.mark.filterwarnings("ignore")
 def test_new_weights_reach_workers():
     # With buffers, torchrl 0.14.1 no longer waits after load_state_dict (pytorch/rl #4341).
-    env = ParallelEnv(
-        2,
-        worker,
-        create_env_kwargs={"kind": "action"},
-        mp_start_method="fork",
-        use_buffers=False,
-    )
+    env = ParallelEnv(2, worker, mp_start_method="fork", use_buffers=False)
     try:
-        fresh = worker("action")
+        fresh = worker()
         with torch.no_grad():
             fresh.transform[1].model.module.right.fill_(20.0)
         up = lambda td: td.set("action", torch.zeros(td.shape, dtype=torch.int64))  # noqa: E731

@@ -37,9 +37,8 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
     Observations hold ``pixels``, uint8 [N, 3, H, W], and ``instruction``, int64 [N, 16]; sentences
     are in ``infos["instruction_text"]``, and ``infos["is_success"]`` is there when an episode ends.
     The reward is 1 for an episode that ends with its instruction fulfilled, else 0. A seeded reset
-    begins with the first ``num_envs`` scenes of the seed's stream, and every world that ends goes
-    on with the stream's next scene; ``reset(options={"scene": numbers})`` begins with scenes of it
-    by their numbers, int [N].
+    begins with the first scenes of the seed's stream, and every world that ends goes on with its
+    next one; ``reset(options={"scene": numbers})`` begins with numbered ones, int [N].
 
     Args:
         task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
@@ -165,7 +164,7 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         return tuple(self._frames()) if self.render_mode == "rgb_array" else None
 
     def _act(self, actions: np.ndarray) -> list[np.ndarray]:
-        """Step all worlds; return success, terminated and truncated, bool [num_envs] each."""
+        """Step all worlds; return success, terminated and truncated, bool [N] each."""
         if not self._simulator.started:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         given = torch.from_numpy(np.ascontiguousarray(actions))
@@ -261,7 +260,8 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         self._worlds.np_random = self.np_random
         observations, infos = self._worlds.reset(seed=seed, options=options)
         self._show()
-        return _only(observations), {TEXT: infos[TEXT][0]}
+        first = {name: value[0] for name, value in observations.items()}
+        return first, {TEXT: infos[TEXT][0]}
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action, 0..5."""
@@ -271,7 +271,8 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         if terminated or truncated:
             info[SUCCESS] = success
         self._show()
-        return _only(self._worlds._observe()), float(success), terminated, truncated, info
+        observation = {name: value[0] for name, value in self._worlds._observe().items()}
+        return observation, float(success), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Draw the world, uint8 [H, W, 3]; in mode ``human`` show it in the window instead."""
@@ -288,7 +289,3 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
     def _show(self) -> None:
         if self._window is not None:
             self._window.show(self._worlds._frames()[0], self._worlds._texts[0])
-
-
-def _only(observations: Observation) -> Observation:
-    return {name: value[0] for name, value in observations.items()}

@@ -58,8 +58,8 @@ class Simulator:
         device: torch.device | str | None = None,
     ) -> None:
         check_choice("tile size", tile_size, TILE_SIZES)
-        self.options, self.num_envs = options, at_least_one("num_envs", num_envs)
-        self.tile_size = tile_size
+        at_least_one("num_envs", num_envs)
+        self.options, self.num_envs, self.tile_size = options, num_envs, tile_size
         self.device = torch.device(device or "cpu")
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.numbers = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
@@ -75,9 +75,7 @@ class Simulator:
     @torch.inference_mode(False)
     def to(self, device: torch.device | str) -> Simulator:
         """Move the running episodes and all that follow to a device."""
-        if (device := torch.device(device)) == self.device:
-            return self
-        self.device = device
+        self.device = torch.device(device)
         self.steps, self.numbers = self.steps.to(self.device), self.numbers.to(self.device)
         if self._episodes is not None:
             scene = self.scene.to(self.device)
@@ -115,12 +113,7 @@ class Simulator:
 
     @torch.inference_mode(False)
     def reset(self, rows: Tensor, numbers: Tensor | None = None) -> None:
-        """Begin new episodes in some rows.
-
-        Args:
-            rows: which, int64 [R].
-            numbers: numbers of the scenes to begin with, int64 [R]; by default the stream's next.
-        """
+        """Begin new episodes in some rows, int64 [R], by default with the stream's next scenes."""
         if numbers is None:
             first = self.next_number
             numbers = torch.arange(first, first + len(rows), device=self.device)

@@ -50,23 +50,22 @@ def from_gymnasium(
     Args:
         world: id for :func:`gymnasium.make`, or a function that makes the world (then give it all
             it needs, wrappers included).
-        vocabulary: the words of the instructions, that of the demonstrations.
+        vocabulary: that of the demonstrations.
         num_envs: worlds side by side.
         image: name of the image in the observation; None where the observation is the image.
         instruction: name of the sentence in the observation, or else in ``info``.
-        instructed: whether episodes show their instruction and pay their reward. Without, only
-            images are read, and an episode that the world ends counts as truncated: what the world
-            was asked for is no business of a learner.
+        instructed: whether episodes show their instruction and pay their reward. Without, an
+            episode that the world ends counts as truncated: what the world was asked for is no
+            business of a learner.
         stop: how a policy says that it is done: the number of the action that ends an episode; or,
             where none does, of one that does nothing, such as MiniGrid's ``done`` (6), or ``"add"``
             for one more action that never reaches the world. It terminates the episode, and is the
             environment's ``stop_action``; close the demonstrations with
-            :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match. None: nothing that
-            a policy does ends an episode as far as a learner is told.
-        skip_unknown: whether words that the vocabulary does not hold are left out of instructions;
-            otherwise they are refused.
+            :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match. None: no action
+            ends an episode as far as a learner is told.
+        skip_unknown: whether unknown words are left out of instructions, or refused.
         processes: whether every world runs in a process of its own, for which a script needs its
-            ``if __name__ == "__main__":``, as all that begin processes do.
+            ``if __name__ == "__main__":``.
         seed: of the stream of scenes; random by default.
         stream: ``training``, ``validation`` or ``evaluation``: disjoint scenes.
         device: where tensors go.

@@ -115,11 +115,7 @@ class InstructionTransform(EpisodeTransform):
         )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Declare the instruction.
-
-        Raises:
-            UserError: where the environment does not suit or has an instruction already.
-        """
+        """Declare the instruction, in an environment that suits and has none."""
         if self.container is not None:
             self.check_env(self.container)
         key = self.out_keys[0]
@@ -161,11 +157,7 @@ def check_pool(pool: Tensor) -> Tensor:
 
 
 def rows_of(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return an entry of a tensordict [*B], its batch made one dimension.
-
-    Raises:
-        UserError: where the entry is missing.
-    """
+    """Return an entry of a tensordict [*B], its batch made one dimension."""
     value = tensordict.get(key, None)
     if value is None:
         raise UserError(
@@ -178,11 +170,7 @@ def rows_of(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def flat_logit(logit: Tensor, rows: int, name: NestedKey) -> Tensor:
-    """Check a model's output and return it as [rows].
-
-    Raises:
-        UserError: where its shape is not [rows, 1] or it is not a number.
-    """
+    """Return a model's output as [rows], or raise :class:`UserError` where it is no such logit."""
     if logit.numel() != rows:
         raise UserError(f"{name!r} must have shape [{rows}, 1], got {list(logit.shape)}")
     if logit.isnan().any():

@@ -23,9 +23,9 @@ class GoalReward(RewardTransform):
     An extension of the paper. The goal classifier sees the first image of the episode, the image
     after the step, and the instruction; it assumes that demonstrations end in success. Steps before
     the stop are paid nothing, and so are episodes that are cut. The transform carries the first
-    image as ``initial_pixels``. The true reward stays where it is; the classifier moves with the
-    environment's device and keeps its mode (train or eval). Called on a tensordict, or appended to
-    a replay buffer, the transform relabels steps that were collected before.
+    image as ``initial_pixels``. The true reward stays where it is, and the classifier in its mode
+    (train or eval). Called on a tensordict, or appended to a replay buffer, the transform relabels
+    steps that were collected before.
 
     Args:
         goal_classifier: TensorDictModule to a logit from ``pixels``, the image after the step, and
@@ -127,12 +127,7 @@ class GoalReward(RewardTransform):
         return next_tensordict
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Declare the learned reward beside the true one.
-
-        Raises:
-            UserError: where the environment pays a reward of that name already, or has no such
-                stop.
-        """
+        """Declare the learned reward beside the true one."""
         if self.stop_action is not None and self.parent is not None:
             count = getattr(self.parent.full_action_spec.get(self.in_keys[-1], None), "n", None)
             if isinstance(count, int) and self.stop_action >= count:

@@ -60,11 +60,7 @@ class RewardTransform(EpisodeTransform):
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the reward of collected steps [*B] below ``next``.
-
-        Raises:
-            UserError: where an entry is missing that the model reads.
-        """
+        """Write the reward of collected steps [*B] below ``next``."""
         after = tensordict.get(NEXT, tensordict.empty())
         after.set(self.out_keys[0], self.pay(tensordict, after))
         return tensordict.set(NEXT, after)
@@ -106,11 +102,7 @@ class RewardTransform(EpisodeTransform):
         return torch.cat(parts).to(home)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Declare the learned reward beside the true one.
-
-        Raises:
-            UserError: where the environment pays a reward of that name already.
-        """
+        """Declare the learned reward beside the true one."""
         if (key := self.out_keys[0]) in reward_spec.keys(True, True):
             raise UserError(
                 f"the environment pays {key!r} already, which stays where it is: give other "
@@ -135,9 +127,8 @@ class LearnedReward(RewardTransform):
 
     The reward is ``rwd(s, t, a)``, the sigmoid of the reward model's logit for the state, the
     instruction and the action, written under ``("next", "learned_reward")``. The true reward stays
-    where it is. The model moves with the environment's device; its mode (train or eval) is left as
-    it is. Called on a tensordict, or appended to a replay buffer, the transform relabels steps that
-    were collected before.
+    where it is, and the model in its mode (train or eval). Called on a tensordict, or appended to a
+    replay buffer, the transform relabels steps that were collected before.
 
     Args:
         reward_model: TensorDictModule from (pixels, instruction, action) to a logit.

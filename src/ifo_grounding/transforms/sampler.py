@@ -26,12 +26,11 @@ class InstructionSampler(InstructionTransform):
 
     At each reset, full or partial, some instructions of the pool are scored for each new state and
     one above the threshold is kept for the episode. Where there is none, the simulator draws a new
-    state for that row (paper, "Instruction Module"). The instruction is written at the reset,
-    carried along by every step, and declared in the specs.
+    state for that row (paper, "Instruction Module"). Every step carries the instruction along.
 
-    The classifier moves with the environment's device. Its mode (train or eval) is left as it is.
-    Instructions come from the transform's own generator, so ``env.set_seed`` leaves them alone; in
-    workers of a batched environment, give each worker's transform a seed of its own.
+    The classifier's mode (train or eval) is left as it is. Instructions come from the transform's
+    own generator, so ``env.set_seed`` leaves them alone; in workers of a batched environment, give
+    each worker's transform a seed of its own.
 
     Args:
         classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
@@ -102,10 +101,8 @@ class InstructionSampler(InstructionTransform):
     def stats(self) -> dict[str, float]:
         """Return what happened since the last call, and start counting anew.
 
-        Returns:
-            ``states_drawn`` and ``states_served`` (those that got an instruction), their ratio
-            ``served_share``, ``candidates_scored``, and ``mean_score``, the mean probability of
-            the chosen pairs.
+        ``states_served`` are those that got an instruction, ``served_share`` their share of
+        ``states_drawn``; ``mean_score`` is the mean probability of the chosen pairs.
         """
         stats = {
             "states_drawn": float(self._drawn),
@@ -174,11 +171,7 @@ class InstructionSampler(InstructionTransform):
         return parent.reset(request, select_reset_only=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write a suitable instruction for every state of a tensordict [*B].
-
-        Raises:
-            NothingSuitableError: where a state has none, as no simulator can draw another.
-        """
+        """Write a suitable instruction for every state of a tensordict [*B], or raise."""
         index, score = self._choose(rows_of(tensordict, self.in_keys[0]))
         if (index < 0).any():
             raise NothingSuitableError(

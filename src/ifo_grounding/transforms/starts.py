@@ -27,9 +27,7 @@ class StartingPairs(InstructionTransform):
 
     The paper's second phase explores from 5K or 10K chosen pairs (paper, "Experimental Settings");
     :func:`ifo_grounding.training.select_pairs` stores them. Each pair is used once, in random
-    order, before any is used again. The scene's number is handed to the simulator at the reset;
-    the instruction is written at the reset, carried along by every step, and declared in the
-    specs.
+    order, before any is used again. Every step carries the instruction along.
 
     Args:
         pairs: TensorDict [N] with ``scene`` int64 [N, 1] and ``instruction`` int64 [N, L]. With
