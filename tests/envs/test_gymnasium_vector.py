@@ -15,11 +15,6 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
 from ifo_grounding.tasks import VOCABULARY, expert
 
-NAMES = {
-    "move": "ifo_grounding/Move-v0",
-    "pick": "ifo_grounding/Pick-v0",
-    "pick-out": "ifo_grounding/PickOut-v0",
-}
 UP = 0
 
 
@@ -31,12 +26,14 @@ def wise(env) -> np.ndarray:
 
 @pytest.mark.filterwarnings("error")  # Gymnasium's own logger ends in warnings.warn
 def test_make_vec_is_native():
-    envs = gymnasium.make_vec(NAMES["pick"], num_envs=5)
+    envs = gymnasium.make_vec("ifo_grounding/Pick-v0", num_envs=5)
     assert isinstance(envs, PickAndPlaceVectorEnv)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     observations, infos = envs.reset(seed=0)
     assert observations in envs.observation_space
-    assert envs.single_observation_space == gymnasium.make(NAMES["pick"]).observation_space
+    assert (
+        envs.single_observation_space == gymnasium.make("ifo_grounding/Pick-v0").observation_space
+    )
     assert envs.action_space.shape == (5,)
     said = VOCABULARY.decode(torch.from_numpy(observations["instruction"]))
     assert infos["instruction_text"].tolist() == said
@@ -48,8 +45,10 @@ def test_one_world_many_worlds_and_torchrl_agree(mode):
     """The same scenes and actions give the same pixels, words, rewards and ends in all three."""
     n, options = 6, {"max_steps": 9}
     batch = PickAndPlaceEnv("pick-out", n, seed=9, **options)
-    envs = gymnasium.make_vec(NAMES["pick-out"], num_envs=n, autoreset_mode=mode, **options)
-    one = gymnasium.make(NAMES["pick-out"], **options)
+    envs = gymnasium.make_vec(
+        "ifo_grounding/PickOut-v0", num_envs=n, autoreset_mode=mode, **options
+    )
+    one = gymnasium.make("ifo_grounding/PickOut-v0", **options)
     td, (seen, infos), (single, info) = batch.reset(), envs.reset(seed=9), one.reset(seed=9)
     draw = np.random.default_rng(0)
     live, success = np.ones(n, bool), 0.0
@@ -91,7 +90,7 @@ def test_one_world_many_worlds_and_torchrl_agree(mode):
 
 
 def test_next_step_autoreset_takes_a_step_of_its_own():
-    envs = gymnasium.make_vec(NAMES["move"], num_envs=3)
+    envs = gymnasium.make_vec("ifo_grounding/Move-v0", num_envs=3)
     first, _ = envs.reset(seed=0)
     ended, rewards, terminated, _, infos = envs.step(np.array([STOP, UP, STOP]))
     assert terminated.tolist() == [True, False, True]
@@ -109,7 +108,9 @@ def test_next_step_autoreset_takes_a_step_of_its_own():
 
 
 def test_without_autoreset_the_caller_resets():
-    envs = gymnasium.make_vec(NAMES["move"], num_envs=3, autoreset_mode=AutoresetMode.DISABLED)
+    envs = gymnasium.make_vec(
+        "ifo_grounding/Move-v0", num_envs=3, autoreset_mode=AutoresetMode.DISABLED
+    )
     before, _ = envs.reset(seed=0)
     envs.step(np.array([STOP, UP, STOP]))
     with pytest.raises(UserError, match="2 worlds have ended"):
@@ -125,8 +126,10 @@ def test_without_autoreset_the_caller_resets():
 
 def test_infos_equal_those_of_gymnasium_s_own_vectorizer():
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
-        native = gymnasium.make_vec(NAMES["move"], 2, autoreset_mode=mode)
-        loop = gymnasium.make_vec(NAMES["move"], 2, "sync", vector_kwargs={"autoreset_mode": mode})
+        native = gymnasium.make_vec("ifo_grounding/Move-v0", 2, autoreset_mode=mode)
+        loop = gymnasium.make_vec(
+            "ifo_grounding/Move-v0", 2, "sync", vector_kwargs={"autoreset_mode": mode}
+        )
         formats = []
         for envs in (native, loop):
             seen = [shape(envs.reset(seed=0)[1])]
@@ -148,7 +151,7 @@ def shape(infos: dict) -> dict:
 
 
 def test_observations_and_infos_are_new_at_every_call():
-    envs = gymnasium.make_vec(NAMES["pick"], num_envs=3)
+    envs = gymnasium.make_vec("ifo_grounding/Pick-v0", num_envs=3)
     kept, infos = envs.reset(seed=0)
     copies = {name: value.copy() for name, value in kept.items()}
     texts = infos["instruction_text"].copy()
@@ -159,7 +162,7 @@ def test_observations_and_infos_are_new_at_every_call():
 
 
 def test_gymnasium_s_vector_wrappers_work():
-    envs = RecordEpisodeStatistics(gymnasium.make_vec(NAMES["move"], num_envs=4))
+    envs = RecordEpisodeStatistics(gymnasium.make_vec("ifo_grounding/Move-v0", num_envs=4))
     envs.reset(seed=0)
     for _ in range(30):
         envs.step(wise(envs.unwrapped))

@@ -75,16 +75,6 @@ def test_on_arrival_the_episode_ends():
     assert torch.allclose(after["learned_reward"][..., 0], reached * SURE)
 
 
-def test_a_partial_reset_keeps_the_other_rows_first_image():
-    env = make(goal(), batch=(4,))
-    tensordict = env.rollout(3, constantly(0))[:, -1]["next"]
-    mask = torch.tensor([[True], [False], [False], [True]])
-    after = env.reset(tensordict.exclude("reward", "learned_reward").set("_reset", mask.clone()))
-    kept, begun = [1, 2], [0, 3]
-    assert torch.equal(after["initial_pixels"][kept], tensordict["initial_pixels"][kept])
-    assert torch.equal(after["initial_pixels"][begun], after["pixels"][begun])
-
-
 def test_a_replay_buffer_pays_what_the_environment_paid():
     rollout = make(goal()).rollout(30, expert, break_when_any_done=False).reshape(-1)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=64, transform=goal())

@@ -25,12 +25,6 @@ def suits(tensordict):
     return tensordict["instruction"][..., 0] - 1 > shown(tensordict["pixels"])
 
 
-def reset_rows(env, tensordict, *rows):
-    mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
-    mask[list(rows)] = True
-    return env.reset(tensordict.clone().set("_reset", mask))
-
-
 def test_unsuitable_states_are_drawn_again_for_those_rows_only():
     world = CounterWorld((10,))  # its ten scenes show ten numbers: only 9 has no instruction
     env = make(world=world)
@@ -44,7 +38,9 @@ def test_unsuitable_states_are_drawn_again_for_those_rows_only():
 def test_partial_resets_touch_their_rows_only(rows):
     env = make((4,), StepCounter())
     tensordict = env.rollout(3, policy=go_up, break_when_any_done=False)[:, -1]["next"]
-    after = reset_rows(env, tensordict.exclude("reward"), *rows)
+    mask = torch.zeros(4, 1, dtype=torch.bool)
+    mask[list(rows)] = True
+    after = env.reset(tensordict.exclude("reward").clone().set("_reset", mask))
     others = [row for row in range(4) if row not in rows]
     for key in ("pixels", "instruction", "step_count"):
         assert torch.equal(after[key][others], tensordict[key][others]), key
@@ -104,14 +100,11 @@ def test_stats_count_and_start_anew():
 
 def test_mode_of_the_classifier_is_left_alone():
     model = classifier().train()
-    env = make(model=model)
-    env.rollout(10, break_when_any_done=False)
-    assert model.training and model.module.dropout.training
-    env.eval()
-    assert model.training
-    model.eval()
-    env.train()
+    env = make(model=model).eval()
     env.reset()
+    assert model.training and model.module.dropout.training
+    model.eval()
+    env.train().reset()
     assert not model.training
 
 
@@ -153,7 +146,7 @@ def test_called_on_states_it_chooses_for_each():
 
 
 def test_another_classifier_may_take_the_place_of_the_first():
-    env = make()
+    env = make(max_tries=2)
     env.transform.classifier = constant(-9.0)
     with pytest.raises(NothingSuitableError):
         env.reset()
@@ -171,10 +164,11 @@ def test_nothing_suitable_is_one_clear_line():
     assert isinstance(caught.value, UserError) and isinstance(caught.value, RuntimeError)
 
 
-@pytest.mark.parametrize("options", [{"max_tries": 0}, {"threshold": 2.0}])
-def test_impossible_options(options):
-    with pytest.raises(UserError):
-        make(**options)
+def test_impossible_options_are_refused_at_once():
+    with pytest.raises(UserError, match="max_tries must be at least 1"):
+        make(max_tries=0)
+    with pytest.raises(UserError, match="threshold is a probability"):
+        make(threshold=2.0)
 
 
 def test_specs_are_those_of_an_instructed_environment():

@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
-from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.transforms import StartingPairs, frame_hash
 from transforms.counter_world import CounterWorld, shown
@@ -83,19 +82,6 @@ def test_state_dict_resumes_the_order():
     starts(env, 3)
     other.load_state_dict(env.state_dict())
     assert starts(env, 10) == starts(other, 10)
-
-
-def test_the_real_world_begins_with_the_scenes():
-    pairs = make_pairs(5, 16)
-    world = PickAndPlaceEnv("move", num_envs=5, seed=3, instructed=False)
-    pairs["frame_hash"] = frame_hash(
-        world.reset(TensorDict({"scene": pairs["scene"]}, [5]))["pixels"]
-    )
-    env = make(pairs=pairs, world=PickAndPlaceEnv("move", num_envs=2, seed=3, instructed=False))
-    for _ in range(5):
-        instruction = env.reset()["instruction"]
-        assert torch.equal(instruction[:, 1], env.scene_numbers)
-    assert env.observation_spec["instruction"].high.max() == world.vocabulary_size - 1
 
 
 def test_other_scenes_than_the_stored_ones_are_noticed():
