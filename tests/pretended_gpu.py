@@ -18,7 +18,6 @@ from torch.utils._pytree import tree_map_only
 from ifo_grounding.training import supervised
 
 GPU = torch.device("cuda", 0)
-PLACED = "pretended"
 ACROSS = {"copy_", "__set__"}
 """What may read from another device than it writes to."""
 INDEXING = {"__getitem__", "__setitem__"}
@@ -54,7 +53,6 @@ def pretended_gpu() -> Iterator[None]:
         patch.setattr(supervised, "CapturedUpdate", lambda update: update)
         patch.setattr(supervised, "let_capture", lambda optimizer, captured: None)
         patch.setattr(torch, "save", _saving(torch.save))
-        patch.setattr(torch, "load", _loading(torch.load))
         patch.setattr(torch.nn.Module, "_apply", _swapping(torch.nn.Module._apply))
         fork = torch.random.fork_rng
         patch.setattr(torch.random, "fork_rng", lambda devices=(), **rest: fork((), **rest))
@@ -122,9 +120,6 @@ class _Mode(TorchFunctionMode):
     def cpu(self, function: Any, args: Any, kwargs: Any) -> Any:
         return self.to(torch.Tensor.to, (args[0], "cpu"), kwargs)
 
-    def cuda(self, function: Any, args: Any, kwargs: Any) -> Any:
-        return self.to(torch.Tensor.to, (args[0], GPU), kwargs)
-
     def parse_to(self, function: Any, args: Any, kwargs: Any) -> Any:
         return function(*args, **kwargs)
 
@@ -151,7 +146,6 @@ class _Mode(TorchFunctionMode):
         "__get__": get,
         "to": to,
         "cpu": cpu,
-        "cuda": cuda,
         "_parse_to": parse_to,
         "_has_compatible_shallow_copy_type": has_compatible_shallow_copy_type,
         "numpy": numpy,
@@ -213,34 +207,10 @@ def _swapping(apply: Callable) -> Callable:
 
 
 def _saving(save: Callable) -> Callable:
-    """Write plain tensors, and which of them lay on the GPU."""
+    """Write plain tensors, as all that is loaded comes to the CPU first."""
 
     def saved(content: Any, *args: Any, **kwargs: Any) -> None:
-        placed = []
-
-        def plain(tensor: torch.Tensor) -> torch.Tensor:
-            placed.append(_on_gpu(tensor))
-            return _taken(tensor.detach())
-
-        content = tree_map_only(torch.Tensor, plain, content)
-        save({PLACED: placed, "content": content}, *args, **kwargs)
+        plain = tree_map_only(torch.Tensor, lambda tensor: _taken(tensor.detach()), content)
+        save(plain, *args, **kwargs)
 
     return saved
-
-
-def _loading(load: Callable) -> Callable:
-    """Read what :func:`_saving` wrote, to where it was or to where it is asked for."""
-
-    def loaded(*args: Any, map_location: Any = None, **kwargs: Any) -> Any:
-        content = load(*args, map_location="cpu", **kwargs)
-        placed = iter(content[PLACED])
-
-        def restored(tensor: torch.Tensor) -> torch.Tensor:
-            there = next(placed)
-            if map_location is not None:
-                there = _is_gpu(map_location)
-            return _put(tensor) if there else tensor
-
-        return tree_map_only(torch.Tensor, restored, content["content"])
-
-    return loaded

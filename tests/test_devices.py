@@ -36,10 +36,8 @@ def test_what_is_pretended_refuses_what_a_gpu_refuses(tmp_path):
         assert layer.weight.grad.is_cuda
         torch.optim.Adam(layer.parameters(), fused=True).step()
         assert (there[torch.tensor([0, 2])] * torch.tensor(2)).is_cuda
-        torch.save({"a": there, "b": there.cpu()}, tmp_path / "both.pt")
-        both = torch.load(tmp_path / "both.pt")
-        assert both["a"].is_cuda
-        assert not both["b"].is_cuda
+        torch.save({"there": there}, tmp_path / "saved.pt")
+        assert not torch.load(tmp_path / "saved.pt", map_location="cpu")["there"].is_cuda
         for wrong in (
             lambda: layer(torch.ones(3)),
             lambda: there + torch.ones(3),

@@ -32,8 +32,7 @@ class Outcomes(NamedTuple):
     lengths: Tensor
     """Actions taken, the stop included, int64 [N]."""
     stopped: Tensor
-    """Whether the episode terminated, by the policy's stop or by the world, before the limit of
-    its length, bool [N]."""
+    """Whether the episode terminated, by the policy's stop or by the world, bool [N]."""
 
 
 def play(
@@ -73,6 +72,8 @@ def play(
     [1, 1, 1]
     """
     check_choice("mode", mode, MODES)
+    # An environment may declare that rows are stepped after their end; others are reset.
+    steps_on = getattr(type(untransformed(env)), "steps_on", False)
     rows = env.batch_size.numel()
     on = {"device": start.device or env.device}
     success = torch.zeros(rows, dtype=torch.bool, **on)
@@ -97,7 +98,7 @@ def play(
             if not len(active):
                 break
             state = env.step_mdp(stepped)
-            if not _steps_on(env):
+            if not steps_on:
                 state = env.maybe_reset(state)
     return Outcomes(success, lengths, stopped)
 
@@ -110,18 +111,23 @@ def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor
     if isinstance(policy, RandomPolicy):  # draws for the whole batch of its spec
         return policy(state)[env.action_key]
     every = env.action_spec.zero()
-    shape = (env.batch_size.numel(), *every.shape[len(env.batch_size) :])
-    action = every.reshape(shape).clone()
-    asked = policy(state.reshape(shape[0])[active])
-    chosen = _written(asked, env, torch.Size([len(active), *shape[1:]]))
-    _remember(asked, env, state, active)
+    rows = env.batch_size.numel()
+    action = every.reshape(rows, *every.shape[len(env.batch_size) :]).clone()
+    asked = policy(state.reshape(rows)[active])
+    chosen = asked.get(env.action_key, None)
+    _check(chosen, env, torch.Size([len(active), *action.shape[1:]]))
+    for key in env.observation_spec.keys(True, True):
+        following = unravel_key((keys.NEXT, key))
+        if (kept := asked.get(following, None)) is not None:
+            memory = env.observation_spec[key].zero().reshape(rows, *kept.shape[1:])
+            memory[active] = kept.to(memory)
+            state[following] = memory.reshape(*env.batch_size, *kept.shape[1:])
     action[active] = chosen.to(action)
     return action.reshape(every.shape)
 
 
-def _written(asked: TensorDictBase, env: EnvBase, shape: torch.Size) -> Tensor:
-    """Return the actions that a policy wrote; refuse what the environment cannot take."""
-    chosen = asked.get(env.action_key, None)
+def _check(chosen: Tensor | None, env: EnvBase, shape: torch.Size) -> None:
+    """Refuse actions that the environment cannot take."""
     if chosen is None:
         raise UserError(
             f"the policy writes no action: a policy writes its actions under {env.action_key!r}, "
@@ -138,24 +144,3 @@ def _written(asked: TensorDictBase, env: EnvBase, shape: torch.Size) -> Tensor:
             f"the policy's actions are {chosen.dtype}, the environment's are numbers of actions: "
             "make the policy write which action it takes, not values or logits"
         )
-    return chosen
-
-
-def _remember(asked: TensorDictBase, env: EnvBase, state: TensorDictBase, active: Tensor) -> None:
-    """Pass on what a policy with a memory wrote for the next step, such as a recurrent state."""
-    for key in env.observation_spec.keys(True, True):
-        following = unravel_key((keys.NEXT, key))
-        kept = asked.get(following, None)
-        if kept is None:
-            continue
-        every = env.observation_spec[key].zero().reshape(-1, *kept.shape[1:])
-        every[active] = kept.to(every)
-        state[following] = every.reshape(*env.batch_size, *kept.shape[1:])
-
-
-def _steps_on(env: EnvBase) -> bool:
-    """Whether an environment declares that rows may be stepped after their end.
-
-    That spares new scenes for rows that count no more; others are reset.
-    """
-    return getattr(type(untransformed(env)), "steps_on", False)

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import sys
-import warnings
 
 import gymnasium
 import numpy as np
+import pygame
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
@@ -19,19 +19,8 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import TASKS, VOCABULARY
 from ifo_grounding.world import Layout, render
 
-IDS = dict(zip(("Move", "MoveUDLR", "Pick", "PickOut", "PickUDLR"), TASKS, strict=True))
-NAMES = {task: f"ifo_grounding/{name}-v0" for name, task in IDS.items()}
-
-
-@pytest.fixture
-def no_warnings():
-    """Gymnasium warns through its own logger, which ends in warnings.warn."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
-
-
-# --- registration --------------------------------------------------------------------------------
+IDS = ("Move", "MoveUDLR", "Pick", "PickOut", "PickUDLR")
+NAMES = {task: f"ifo_grounding/{name}-v0" for name, task in zip(IDS, TASKS, strict=True)}
 
 
 def test_the_five_ids_are_registered_on_import():
@@ -41,12 +30,9 @@ def test_the_five_ids_are_registered_on_import():
         assert gymnasium.spec(name).max_episode_steps is None  # the limit is the env's own
 
 
-# --- one world -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_gymnasium_checks_pass_without_a_warning(task, no_warnings):
-    check_env(gymnasium.make(NAMES[task]).unwrapped)
+@pytest.mark.filterwarnings("error")  # Gymnasium's own logger ends in warnings.warn
+def test_gymnasium_checks_pass_without_a_warning():
+    check_env(gymnasium.make(NAMES["pick-out"]).unwrapped)
 
 
 def test_spaces_and_infos_are_as_described():
@@ -98,7 +84,8 @@ def test_options_reach_the_world():
     assert "yellow circle" in info["instruction_text"]
 
 
-# --- pictures ------------------------------------------------------------------------------------
+def drawn(env) -> np.ndarray:
+    return render(env._worlds._simulator.state, 32)[0].permute(1, 2, 0).numpy()
 
 
 def test_rgb_array_is_drawn_large():
@@ -106,33 +93,28 @@ def test_rgb_array_is_drawn_large():
     env.reset(seed=0)
     frame = env.render()
     assert (frame.shape, frame.dtype) == ((192, 192, 3), np.uint8)
-    expected = render(env.unwrapped._simulator.state, 32)[0].permute(1, 2, 0).numpy()
-    assert np.array_equal(frame, expected)
-    before = frame.copy()
-    for action in (1, 2):
-        env.step(action)
-    assert not np.array_equal(env.render(), before)
+    assert np.array_equal(frame, drawn(env.unwrapped))
 
 
-def test_a_window_shows_the_world_and_the_instruction(monkeypatch):
-    import pygame
+def in_the_window() -> np.ndarray:
+    surface = pygame.display.get_surface()
+    return pygame.surfarray.array3d(surface).swapaxes(0, 1)
 
+
+def test_a_window_shows_the_world_and_the_instruction():
     env = PickAndPlaceGymEnv("pick", render_mode="human")
-    window = env._window
-    window.fps = 0  # do not wait
-    _, info = env.reset(seed=0)
+    env._window.fps = 0  # do not wait
     for seed in (0, 1):
         _, info = env.reset(seed=seed)
         assert pygame.display.get_caption()[0] == info["instruction_text"]
-        shown = window.pixels()
+        shown = in_the_window()
         assert shown.shape == (192 + LINE_HEIGHT, 192, 3)
-        world = render(env._simulator.state, 32)[0].permute(1, 2, 0).numpy()
-        assert np.array_equal(shown[:192], world)
+        assert np.array_equal(shown[:192], drawn(env))
         assert len(np.unique(shown[192:].reshape(-1, 3), axis=0)) > 10  # letters
-    before = window.pixels().copy()
     env.step(1)
     env.step(2)
-    assert not np.array_equal(window.pixels(), before)
+    assert np.array_equal(in_the_window()[:192], drawn(env))
+    assert not np.array_equal(in_the_window(), shown)
     assert env.render() is None
     env.close()
     assert not pygame.display.get_init()
@@ -149,7 +131,7 @@ def test_a_window_needs_no_screen(monkeypatch, driver):
             monkeypatch.delenv(name)
     env = PickAndPlaceGymEnv("move", render_mode="human")
     env.reset(seed=0)
-    assert env._window.pixels().any()
+    assert in_the_window().any()
     env.close()
 
 
@@ -159,19 +141,16 @@ def test_a_missing_pygame_is_explained(monkeypatch):
         PickAndPlaceGymEnv("move", render_mode="human")
 
 
-# --- other libraries -----------------------------------------------------------------------------
-
-
 def test_stable_baselines_trains_on_the_dict():
     envs = make_vec_env(NAMES["move"], n_envs=2, seed=0)
-    model = PPO("MultiInputPolicy", envs, n_steps=64, batch_size=64, n_epochs=2, seed=0)
+    model = PPO("MultiInputPolicy", envs, n_steps=64, batch_size=64, n_epochs=1, seed=0)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-    model.learn(256)
+    model.learn(128)
     after = model.policy.state_dict()
     changed = [name for name in before if not torch.equal(before[name], after[name])]
     assert any("cnn" in name for name in changed)
     assert any("action_net" in name for name in changed)
-    assert len(model.ep_success_buffer) > 5  # it found info["is_success"]
+    assert len(model.ep_success_buffer) > 2  # it found info["is_success"]
     action, _ = model.predict(envs.reset())
     assert action.shape == (2,)
 
@@ -194,16 +173,15 @@ def test_torchrl_wraps_many_worlds():
     assert rollout["next", "pixels"].shape == (3, 60, 3, 48, 48)
 
 
-# --- mistakes ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", [PickAndPlaceGymEnv, PickAndPlaceVectorEnv])
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("kind", "wrong", "said"),
     [
-        ({"task": "fly"}, "unknown task 'fly'"),
-        ({"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
-        ({"render_mode": "ascii"}, "unknown render mode 'ascii'"),
+        (PickAndPlaceGymEnv, {"task": "fly"}, "unknown task 'fly'"),
+        (PickAndPlaceGymEnv, {"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
+        (PickAndPlaceGymEnv, {"render_mode": "ascii"}, "unknown render mode 'ascii'"),
+        (PickAndPlaceVectorEnv, {"render_mode": "human"}, "unknown render mode 'human'"),
+        (PickAndPlaceVectorEnv, {"num_envs": 0}, "num_envs must be at least 1"),
+        (PickAndPlaceVectorEnv, {"autoreset_mode": "x"}, "mode 'x': choose one of 'NextStep'"),
     ],
 )
 def test_bad_arguments_are_refused(kind, wrong, said):
@@ -211,19 +189,9 @@ def test_bad_arguments_are_refused(kind, wrong, said):
         kind(**wrong)
 
 
-@pytest.mark.parametrize("kind", [PickAndPlaceGymEnv, PickAndPlaceVectorEnv])
-def test_unknown_arguments_are_refused(kind):
+def test_unknown_arguments_are_refused():
     with pytest.raises(TypeError, match="argument 'instructed': scene options are holdout, "):
-        kind(instructed=False)
-
-
-def test_bad_vector_arguments_are_refused():
-    with pytest.raises(UserError, match="num_envs must be at least 1"):
-        PickAndPlaceVectorEnv(num_envs=0)
-    with pytest.raises(UserError, match="unknown autoreset mode 'x': choose one of 'NextStep'"):
-        PickAndPlaceVectorEnv(autoreset_mode="x")
-    with pytest.raises(UserError, match="unknown render mode 'human'"):
-        PickAndPlaceVectorEnv(render_mode="human")
+        PickAndPlaceGymEnv(instructed=False)
 
 
 def test_bad_calls_are_refused():

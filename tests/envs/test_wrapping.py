@@ -1,20 +1,20 @@
 """Worlds that the project did not make, behind its keys."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torchrl.envs import TransformedEnv, check_env_specs
+from torchrl.envs import check_env_specs
 
 from envs.dial import MARKS, PRESS, Dial
 from ifo_grounding.data import collect_transitions
-from ifo_grounding.envs import from_gymnasium
+from ifo_grounding.envs import from_gymnasium, wrapping
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation import record_episodes, return_correlation, success_rate
+from ifo_grounding.evaluation import record_episodes, success_rate
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
-from ifo_grounding.transforms import GoalReward, InstructionSampler
 
 WORDS = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS], length=6)
 DIAL = {"vocabulary": WORDS, "image": "view", "instruction": "task"}
@@ -99,13 +99,6 @@ def test_partial_resets_touch_only_their_rows():
     assert torch.equal(again["next", "pixels"], after["pixels"])  # pressing moves nothing
 
 
-@pytest.mark.parametrize("scene", [-1, 0.5])
-def test_what_is_no_number_of_a_scene_is_refused(scene):
-    env = dials(2)
-    with pytest.raises(UserError, match="scene"):
-        env.reset(TensorDict({"scene": torch.tensor([[0], [scene]])}, [2]))
-
-
 def test_a_learner_sees_neither_reward_nor_the_world_s_own_goal():
     env = dials(8, instructed=False, seed=1)
     rollout = env.rollout(60, break_when_any_done=False)
@@ -128,7 +121,9 @@ def test_a_policy_can_say_that_it_is_done(stop, actions, action, instructed):
     assert not after["reward"].any()
 
 
-def test_processes_show_what_one_process_shows():
+def test_processes_show_what_one_process_shows(monkeypatch):
+    forked = partial(wrapping.AsyncVectorEnv, context="fork")  # for speed
+    monkeypatch.setattr(wrapping, "AsyncVectorEnv", forked)
     apart, together = dials(2, processes=True), dials(2)
     for env in (apart, together):
         torch.manual_seed(0)
@@ -144,7 +139,7 @@ def knows(td):
     return td.set("action", torch.where(away == 0, PRESS, (away > 0).long()))
 
 
-def test_episodes_are_recorded_and_audited_as_they_are_counted():
+def test_episodes_are_recorded_as_they_are_counted():
     half = lambda td: knows(td).set("action", torch.where(wanted(td) < 3, td["action"], PRESS))  # noqa: E731
     result = success_rate(half, dials(7), episodes=14)
     assert 0 < result.rate.rate < 1
@@ -157,15 +152,6 @@ def test_episodes_are_recorded_and_audited_as_they_are_counted():
     with pytest.raises(UserError, match="3 rows for 2 scenes"):
         record_episodes(half, dials(3), [0, 1])
 
-    def at_the_mark(pixels, instruction):
-        td = TensorDict({"pixels": pixels, "instruction": instruction})
-        return 16.0 * (shown(pixels) == wanted(td)).float().unsqueeze(-1) - 8.0
-
-    model = TensorDictModule(at_the_mark, ["pixels", "instruction"], ["goal_score"])
-    reward = GoalReward(model, stop_action=PRESS)
-    audit = return_correlation(half, reward, dials(7), episodes=14, mode="greedy")
-    assert torch.equal(audit.outcomes, result.outcomes) and audit.auc.value == 1.0
-
 
 def test_words_that_nobody_taught_can_be_left_out():
     known = Vocabulary.from_sentences(["turn the dial to one"], length=6)
@@ -175,23 +161,10 @@ def test_words_that_nobody_taught_can_be_left_out():
     assert "turn the dial to" in read and set(read) <= {"turn the dial to", "turn the dial to one"}
 
 
-def test_instructions_can_be_chosen_for_it():
-    def all_suit(pixels, instruction):
-        return torch.full((len(pixels), 1), 9.0)
-
-    classifier = TensorDictModule(all_suit, ["pixels", "instruction"], ["suitability"])
-    pool = WORDS.encode([f"turn the dial to {mark}" for mark in MARKS])
-    env = TransformedEnv(dials(3, instructed=False), InstructionSampler(classifier, pool))
-    check_env_specs(env)
-    assert all(text.startswith("turn") for text in WORDS.decode(env.reset()["instruction"]))
-
-
 class Odd(Dial):
-    def __init__(self, view, action_space=None):
+    def __init__(self, view, action_space=Dial.action_space):
         super().__init__()
-        self.view = view
-        if action_space is not None:
-            self.action_space = action_space
+        self.view, self.action_space = view, action_space
 
     def _observe(self):
         return {"view": self.view, "task": "turn the dial to one"}
@@ -205,12 +178,9 @@ class Odd(Dial):
         (Dial, {"instruction": "mission"}, "no instruction 'mission'.*wanted"),
         (Dial, {"vocabulary": Vocabulary(["turn", "the"])}, "unknown word 'dial'"),
         (Dial, {"num_envs": 0}, "num_envs"),
-        (Dial, {"stop": 7}, "stop must be an action 0..2"),
         (Dial, {"stop": 3}, "stop must be an action 0..2 or 'add', got 3"),
         (Dial, {"stop": 2.0}, "stop must be a whole number, got 2.0"),
-        (Dial, {"stop": True}, "stop must be a whole number"),
         (Dial, {"stop": "press"}, "stop"),
-        (Dial, {"num_envs": 2.5}, "num_envs must be a whole number, got 2.5"),
         (Dial, {"vocabulary": ["turn"]}, "vocabulary is a Vocabulary.*got list"),
         (Dial(), {}, "its class, got Dial"),
         (lambda: "dial", {}, "a world is a gymnasium.Env, got str"),
@@ -256,15 +226,6 @@ def test_it_says_which_action_is_the_stop(stop, named):
     assert set(sample["action"][unchanged].tolist()) == ({named} if stop is not None else set())
     # Pressing shows nothing: without a stop it cannot be told from a bump.
     assert (report.kept[PRESS] > 0) == (named == PRESS)
-
-    model = TensorDictModule(lambda pixels: torch.ones(len(pixels), 1), ["pixels"], ["goal_score"])
-    if stop is None:
-        return
-    paid = TransformedEnv(env, GoalReward(model, stop_action=env.stop_action))
-    rollout = paid.rollout(20, break_when_any_done=False)
-    stopped = rollout["action"] == named
-    assert stopped.any() and torch.equal(rollout["next", "learned_reward"][..., 0] > 0, stopped)
-    assert torch.equal(rollout["next", "terminated"][..., 0], stopped)
 
 
 @pytest.mark.parametrize("shape", [(20, 28), (1, 20, 28), (20, 28, 1), (3, 20, 28)])

@@ -58,24 +58,16 @@ class CounterWorld(EnvBase):
     def _set_seed(self, seed):
         self.seed, self.next_scene = seed or 0, 0
 
-    def _first_number(self, scene):
-        return (scene * 7 + self.seed) % 10
-
     def _reset(self, tensordict=None, **kwargs):
-        mask = torch.ones_like(self.number, dtype=torch.bool)
-        scenes = None
-        if tensordict is not None:
-            if (given := tensordict.get("_reset", None)) is not None:
-                mask = given.reshape(-1)
-            scenes = tensordict.get("scene", None)
-        count = int(mask.sum())
-        if scenes is None:
-            fresh = torch.arange(self.next_scene, self.next_scene + count)
-            self.next_scene += count
+        given = {} if tensordict is None else tensordict
+        mask = given.get("_reset", torch.ones_like(self.number, dtype=torch.bool)).reshape(-1)
+        fresh = torch.arange(self.next_scene, self.next_scene + int(mask.sum()))
+        if (scenes := given.get("scene", None)) is None:
+            self.next_scene += len(fresh)
         else:
             fresh = scenes.reshape(-1)[mask]
         self.scene_numbers[mask] = fresh
-        self.number[mask] = self._first_number(fresh)
+        self.number[mask] = (fresh * 7 + self.seed) % 10
         self.steps[mask] = 0
         self.resets += mask
         return self._observe()
@@ -138,17 +130,6 @@ class Suitability(nn.Module):
         return self.score(self.encode_scenes(pixels), self.encode_instruction(instruction))
 
 
-class Whole(nn.Module):
-    """The same classifier without the two halves."""
-
-    def __init__(self, network):
-        super().__init__()
-        self.network = network
-
-    def forward(self, pixels, instruction):
-        return self.network(pixels, instruction)
-
-
 class RewardModel(nn.Module):
     """Logit 2 for going up below the target and for stopping at it, else -1."""
 
@@ -169,29 +150,35 @@ class GoalClassifier(nn.Module):
     def __init__(self):
         super().__init__()
         self.sure = nn.Parameter(torch.tensor(4.0))
-        self.dropout = nn.Dropout(0.9)
 
     def forward(self, initial_pixels, pixels, instruction):
         target = instruction[..., 0] - 1
         right = (shown(pixels) == target) & (shown(initial_pixels) != target)
-        return self.dropout(torch.where(right, self.sure, -self.sure)).unsqueeze(-1)
+        return torch.where(right, self.sure, -self.sure).unsqueeze(-1)
 
 
-def classifier(nested=False, whole=False):
-    keys = [("agent", "pixels"), ("agent", "instruction")] if nested else ["pixels", "instruction"]
-    network = Suitability()
-    return TensorDictModule(Whole(network) if whole else network, keys, ["suitability"])
+def keys(nested, *names):
+    return [("agent", name) for name in names] if nested else [*names]
+
+
+def classifier(nested=False, network=None):
+    read = keys(nested, "pixels", "instruction")
+    return TensorDictModule(network or Suitability(), read, ["suitability"])
+
+
+def constant(logit):
+    """A classifier that says the same of every pair."""
+    return classifier(network=lambda pixels, instruction: torch.full((len(pixels), 1), logit))
 
 
 def reward_model(nested=False):
-    keys = [("agent", "pixels"), ("agent", "instruction")] if nested else ["pixels", "instruction"]
-    return TensorDictModule(RewardModel(), [*keys, "action"], ["action_score"])
+    read = [*keys(nested, "pixels", "instruction"), "action"]
+    return TensorDictModule(RewardModel(), read, ["action_score"])
 
 
 def goal_classifier(nested=False):
-    names = ["initial_pixels", "pixels", "instruction"]
-    keys = [("agent", name) for name in names] if nested else names
-    return TensorDictModule(GoalClassifier(), keys, ["goal_score"])
+    read = keys(nested, "initial_pixels", "pixels", "instruction")
+    return TensorDictModule(GoalClassifier(), read, ["goal_score"])
 
 
 def make(*rewards, batch=(6,), world=None):

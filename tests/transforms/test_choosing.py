@@ -1,4 +1,4 @@
-"""choose_instructions and PoolScorer, by hand-computed scores."""
+"""PoolScorer, by hand-computed scores."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from tensordict.nn import TensorDictModule
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import generator
-from ifo_grounding.transforms import PoolScorer, choose_instructions
+from ifo_grounding.transforms import PoolScorer
 from ifo_grounding.transforms.choosing import draw_candidates
-from transforms.counter_world import POOL, Suitability, Whole, classifier
+from transforms.counter_world import POOL, Suitability, classifier, constant
 
 SURE = torch.tensor(3.0).sigmoid().item()
 
@@ -21,13 +21,14 @@ def pixels(*numbers):
 
 
 def choose(numbers, model=None, **options):
-    model = model or classifier()
-    return choose_instructions(model, POOL, pixels(*numbers), **options)
+    return PoolScorer(model or classifier(), POOL).choose(pixels(*numbers), **options)
 
 
-@pytest.mark.parametrize("whole", [False, True])
-def test_chooses_only_above_the_threshold(whole):
-    chosen, score = choose([0, 5, 8, 9] * 50, classifier(whole=whole), generator=generator(0))
+@pytest.mark.parametrize("network", [Suitability(), Suitability().eval().forward])
+def test_chooses_only_above_the_threshold(network):
+    """Whether or not the network encodes states and instructions separately."""
+    model = classifier(network=network)
+    chosen, score = choose([0, 5, 8, 9] * 50, model, generator=generator(0))
     targets = chosen.view(50, 4)
     assert (targets[:, 0] >= 1).all() and (targets[:, 1] >= 6).all()
     assert (targets[:, 2] == 9).all() and (targets[:, 3] == -1).all()
@@ -44,28 +45,20 @@ def test_random_choice_is_uniform_over_the_suitable_ones():
 
 @pytest.mark.parametrize("candidates", [1, 3, 10])
 def test_random_choice_does_not_prefer_the_best(candidates):
-    model = TensorDictModule(
-        lambda pixels, instruction: 2.0 + instruction[:, :1], ["pixels", "instruction"], ["logit"]
-    )
+    model = classifier(network=lambda pixels, instruction: 2.0 + instruction[:, :1])
     chosen = choose([0] * 3000, model, candidates=candidates, generator=generator(1)).chosen
     assert ((chosen.bincount(minlength=10) - 300).abs() < 80).all()  # five standard errors
 
 
 def test_best_takes_the_highest_logit():
-    model = TensorDictModule(
-        lambda pixels, instruction: instruction[:, :1] * 1.0, ["pixels", "instruction"], ["logit"]
-    )
+    model = classifier(network=lambda pixels, instruction: instruction[:, :1] * 1.0)
     choices = choose([0, 1], model, choose="best")
     assert choices.chosen.tolist() == [9, 9]
     assert choices.score.tolist() == pytest.approx([torch.tensor(10.0).sigmoid().item()] * 2)
 
 
 def test_threshold_is_on_the_probability():
-    model = TensorDictModule(
-        lambda pixels, instruction: torch.full((len(pixels), 1), 1.38),
-        ["pixels", "instruction"],
-        ["x"],
-    )  # sigmoid(1.38) = 0.799
+    model = constant(1.38)  # sigmoid(1.38) = 0.799
     assert choose([0], model, threshold=0.79).chosen[0] >= 0
     assert choose([0], model, threshold=0.8).chosen[0] == -1
     assert choose([0], model, threshold=0.0).chosen[0] >= 0
@@ -85,7 +78,7 @@ def test_each_instruction_is_encoded_once_until_a_weight_changes():
     network = model.module
     scorer = PoolScorer(model, POOL)
     for _ in range(3):
-        choose_instructions(scorer, None, pixels(*range(9)))
+        scorer.choose(pixels(*range(9)))
     assert network.encoded == 10
     with torch.no_grad():
         network.sharpness.add_(1.0)
@@ -112,21 +105,19 @@ def test_mode_is_eval_while_scoring_and_restored():
 def test_large_batches_are_scored_in_parts():
     sizes = []
 
-    class Sized(Whole):
-        def forward(self, pixels, instruction):
-            sizes.append(len(pixels))
-            return super().forward(pixels, instruction)
+    def sized(pixels, instruction):
+        sizes.append(len(pixels))
+        return torch.full((len(pixels), 1), -9.0)
 
-    model = TensorDictModule(Sized(Suitability()), ["pixels", "instruction"], ["suitability"])
-    assert len(choose([8] * 1000, model).chosen) == 1000
-    assert max(sizes) <= 2048 and 5_000 < sum(sizes) <= 10_000
+    assert len(choose([8] * 1000, classifier(network=sized)).chosen) == 1000
+    assert max(sizes) <= 2048 and sum(sizes) == 10_000
 
 
 def test_a_random_choice_scores_no_more_than_it_needs():
     scorer = PoolScorer(classifier(), POOL)
-    choose_instructions(scorer, None, pixels(*[0] * 100))
+    scorer.choose(pixels(*[0] * 100))
     assert 400 <= scorer.scored < 500
-    choose_instructions(scorer, None, pixels(*[0] * 100), choose="best")
+    scorer.choose(pixels(*[0] * 100), choose="best")
     assert scorer.scored >= 1400
 
 
@@ -164,30 +155,27 @@ def test_impossible_options(options, message):
         (torch.zeros(0, 4).long(), "pool is empty"),
         (torch.zeros(3, 4), "pool must be token ids"),
         (torch.zeros(4).long(), "pool must be token ids"),
-        ([["a"]], "pool must be token ids"),
-        (None, "needs a pool"),
+        (None, "pool must be token ids"),
     ],
 )
 def test_impossible_pools(pool, message):
     with pytest.raises(UserError, match=message):
-        choose_instructions(classifier(), pool, pixels(0))
+        PoolScorer(classifier(), pool)
 
 
-def test_impossible_models():
-    with pytest.raises(UserError, match="expected a TensorDictModule"):
-        choose([0], Suitability())
-    one_input = TensorDictModule(lambda pixels: pixels, ["pixels"], ["suitability"])
-    with pytest.raises(UserError, match="reads pixels and an instruction"):
-        choose([0], one_input)
-    keys = ["pixels", "instruction"]
-    unclear = TensorDictModule(lambda a, b: (a, b), keys, ["x", "y"])
-    with pytest.raises(UserError, match="must be named 'suitability'"):
-        choose([0], unclear)
-    wide = TensorDictModule(lambda a, b: torch.zeros(len(a), 2), keys, ["suitability"])
-    with pytest.raises(UserError, match=r"must have shape \[4, 1\], got \[4, 2\]"):
-        choose([0], wide)
-    diverged = TensorDictModule(
-        lambda a, b: torch.full((len(a), 1), torch.nan), keys, ["suitability"]
-    )
-    with pytest.raises(UserError, match="not a number"):
-        choose([0], diverged)
+BOTH = ["pixels", "instruction"]
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (Suitability(), "expected a TensorDictModule"),
+        (TensorDictModule(lambda a: a, ["pixels"], ["x"]), "reads pixels and an instruction"),
+        (TensorDictModule(lambda a, b: (a, b), BOTH, ["x", "y"]), "must be named 'suitability'"),
+        (classifier(network=lambda a, b: a.new_zeros(len(a), 2)), r"\[4, 1\], got \[4, 2\]"),
+        (constant(torch.nan), "not a number"),
+    ],
+)
+def test_impossible_models(model, message):
+    with pytest.raises(UserError, match=message):
+        choose([0], model)

@@ -44,17 +44,12 @@ def goal(nested=False):
     return GoalReward(goal_classifier(nested), STOP, out_keys=out_keys)
 
 
-def pairs():
-    return StartingPairs(PAIRS)
-
-
 MAKERS = {
     "sampler": lambda: [sampler()],
     "sampler and rewards": lambda: [sampler(), action(), goal()],
     "rewards and sampler": lambda: [goal(), action(), sampler()],
-    "pairs and rewards": lambda: [pairs(), goal(), action()],
+    "pairs and rewards": lambda: [StartingPairs(PAIRS), goal(), action()],
 }
-OUTSIDE = ("sampler", "sampler and rewards", "rewards and sampler")
 
 
 def inside(name, batch=(2,)):
@@ -62,8 +57,14 @@ def inside(name, batch=(2,)):
     return TransformedEnv(CounterWorld(batch), parts[0] if len(parts) == 1 else Compose(*parts))
 
 
-def consistent(rollout, name):
+def around(workers, name):
+    return TransformedEnv(workers, Compose(*MAKERS[name]()))
+
+
+def check(env, name):
     """Check what must hold of any rollout, however its environment was put together."""
+    check_env_specs(env, break_when_any_done="both")
+    rollout = env.rollout(20, break_when_any_done=False)
     started = torch.ones(rollout.shape, dtype=torch.bool)
     started[..., 1:] = rollout["next", "done"][..., :-1, 0]
     assert started[..., 1:].any()
@@ -71,65 +72,67 @@ def consistent(rollout, name):
     if "pairs" in name:  # 9 shown asks for 0
         suitable |= shown(rollout["pixels"]) == 9
     assert suitable[started].all()
-    assert torch.equal(rollout["next", "instruction"], rollout["instruction"])
-    kept = (rollout["instruction"][..., 1:, :] == rollout["instruction"][..., :-1, :]).all(-1)
-    assert kept[~started[..., 1:]].all()
+    for key in ("instruction", "initial_pixels") if "reward" in name else ("instruction",):
+        assert torch.equal(rollout["next", key], rollout[key])
+        values = rollout[key].flatten(rollout.ndim)
+        kept = (values[..., 1:, :] == values[..., :-1, :]).all(-1)
+        assert kept[~started[..., 1:]].all() and not kept.all()
     if "reward" in name:
         assert torch.equal(rollout["initial_pixels"][started], rollout["pixels"][started])
         for transform, key in ((action(), ("next", "rwd")), (goal(), ("next", "learned_reward"))):
             assert torch.equal(transform(rollout.exclude(key))[key], rollout[key])
-
-
-def check(env, name):
-    try:
-        check_env_specs(env, break_when_any_done="both")
-        rollout = env.rollout(20, break_when_any_done=False)
-        consistent(rollout, name)
-        flat = rollout.reshape(-1, rollout.shape[-1])
-        for key in ("pixels", "instruction"):
-            rollout_consistency_assertion(flat, observation_key=key, done_strict=True)
-    finally:
-        env.close()
-
-
-pytestmark = pytest.mark.filterwarnings("ignore:A lambda function was passed to ParallelEnv")
+    flat = rollout.reshape(-1, rollout.shape[-1])
+    for key in ("pixels", "instruction"):
+        rollout_consistency_assertion(flat, observation_key=key, done_strict=True)
 
 
 @pytest.mark.parametrize("name", MAKERS)
-class TestContract:
-    @pytest.mark.parametrize("batch", [(), (2, 3)])
-    def test_single(self, name, batch):
-        check(inside(name, batch), name)
-
-    @pytest.mark.parametrize("batch", [(), (3,)])
-    def test_serial_inside(self, name, batch):
-        check(SerialEnv(2, lambda: inside(name, batch)), name)
-
-    def test_parallel_inside(self, name):
-        check(ParallelEnv(2, lambda: inside(name), mp_start_method="fork"), name)
-
-    def test_parallel_inside_a_plain_transformed_env(self, name):
-        # Workers are reset by a command of their own here, which reaches them without entries.
-        check(TransformedEnv(ParallelEnv(2, lambda: inside(name), mp_start_method="fork")), name)
-
-    def test_collected(self, name):
-        collector = Collector(inside(name, (4,)), frames_per_batch=60, total_frames=120)
-        batches = list(collector)
-        collector.shutdown()
-        for batch in batches:
-            assert torch.equal(batch["next", "instruction"], batch["instruction"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda name: inside(name, ()),
+        lambda name: inside(name, (2, 3)),
+        lambda name: SerialEnv(2, lambda: inside(name, ())),
+        lambda name: SerialEnv(2, lambda: inside(name, (3,))),
+    ],
+)
+def test_around_one_world_or_in_serial_workers(name, make):
+    check(make(name), name)
 
 
-@pytest.mark.parametrize("name", OUTSIDE)
-class TestOutside:
-    @pytest.mark.parametrize("batch", [(), (3,)])
-    def test_serial(self, name, batch):
-        env = TransformedEnv(SerialEnv(2, lambda: CounterWorld(batch)), Compose(*MAKERS[name]()))
-        check(env, name)
+@pytest.mark.parametrize("name", ["sampler", "sampler and rewards", "rewards and sampler"])
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_around_serial_workers(name, batch):
+    check(around(SerialEnv(2, lambda: CounterWorld(batch)), name), name)
 
-    def test_parallel(self, name):
-        workers = ParallelEnv(2, lambda: CounterWorld((2,)), mp_start_method="fork")
-        check(TransformedEnv(workers, Compose(*MAKERS[name]())), name)
+
+@pytest.mark.filterwarnings("ignore:A lambda function was passed to ParallelEnv")
+@pytest.mark.parametrize(
+    ("name", "world"),
+    [
+        ("sampler and rewards", inside),
+        ("pairs and rewards", inside),
+        ("sampler and rewards", lambda _: CounterWorld((2,))),
+    ],
+)
+def test_with_parallel_workers(name, world):
+    workers = ParallelEnv(2, lambda: world(name), mp_start_method="fork")
+    try:
+        if world is inside:
+            check(workers, name)
+        # In a plain TransformedEnv workers are reset by a command that reaches them without entries
+        check(TransformedEnv(workers) if world is inside else around(workers, name), name)
+    finally:
+        workers.close()
+
+
+@pytest.mark.parametrize("name", ["sampler and rewards", "pairs and rewards"])
+def test_collected(name):
+    collector = Collector(inside(name, (4,)), frames_per_batch=60, total_frames=120)
+    batches = list(collector)
+    collector.shutdown()
+    for batch in batches:
+        assert torch.equal(batch["next", "instruction"], batch["instruction"])
 
 
 @pytest.mark.parametrize("order", [(sampler, action, goal), (goal, action, sampler)])
@@ -149,7 +152,7 @@ def test_nested_keys(order):
 
 
 def test_pairs_outside_of_workers_are_refused():
-    env = TransformedEnv(SerialEnv(2, CounterWorld), pairs())
+    env = TransformedEnv(SerialEnv(2, CounterWorld), StartingPairs(PAIRS))
     with pytest.raises(ValueError, match="cannot reach the simulators through a SerialEnv"):
         env.reset()
 

@@ -7,13 +7,12 @@ import pickle
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
 
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.transforms import InstructionSampler, NothingSuitableError
-from transforms.counter_world import POOL, CounterWorld, classifier, shown
+from transforms.counter_world import POOL, CounterWorld, classifier, constant, shown
 
 
 def make(batch=(4,), *before, model=None, pool=POOL, world=None, **options):
@@ -24,25 +23,6 @@ def make(batch=(4,), *before, model=None, pool=POOL, world=None, **options):
 
 def suits(tensordict):
     return tensordict["instruction"][..., 0] - 1 > shown(tensordict["pixels"])
-
-
-def reset_rows(env, tensordict, *rows):
-    mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
-    mask[list(rows)] = True
-    return env.reset(tensordict.clone().set("_reset", mask))
-
-
-def test_every_start_suits_and_the_instruction_lasts_the_episode():
-    env = make((16,))
-    rollout = env.rollout(40, break_when_any_done=False)
-    assert rollout["instruction"].shape == (16, 40, 4)
-    starts = torch.ones(16, 40, dtype=torch.bool)
-    starts[:, 1:] = rollout["next", "done"][:, :-1, 0]
-    assert starts.sum() > 100
-    assert suits(rollout[starts]).all()
-    assert torch.equal(rollout["next", "instruction"], rollout["instruction"])
-    same = (rollout["instruction"][:, 1:] == rollout["instruction"][:, :-1]).all(-1)
-    assert same[~starts[:, 1:]].all() and not same[starts[:, 1:]].all()
 
 
 def test_unsuitable_states_are_drawn_again_for_those_rows_only():
@@ -58,7 +38,9 @@ def test_unsuitable_states_are_drawn_again_for_those_rows_only():
 def test_partial_resets_touch_their_rows_only(rows):
     env = make((4,), StepCounter())
     tensordict = env.rollout(3, policy=go_up, break_when_any_done=False)[:, -1]["next"]
-    after = reset_rows(env, tensordict.exclude("reward"), *rows)
+    mask = torch.zeros(4, 1, dtype=torch.bool)
+    mask[list(rows)] = True
+    after = env.reset(tensordict.exclude("reward").clone().set("_reset", mask))
     others = [row for row in range(4) if row not in rows]
     for key in ("pixels", "instruction", "step_count"):
         assert torch.equal(after[key][others], tensordict[key][others]), key
@@ -85,10 +67,9 @@ def test_state_dict_resumes_the_choices():
     other.reset()
     other.load_state_dict(env.state_dict())
     assert torch.equal(env.reset()["instruction"], other.reset()["instruction"])
-    env.transform.set_seed(3)
-    other.transform.set_seed(3)
-    env.base_env.set_seed(0)
-    other.base_env.set_seed(0)
+    for each in (env, other):
+        each.transform.set_seed(3)
+        each.base_env.set_seed(0)
     assert torch.equal(env.reset()["instruction"], other.reset()["instruction"])
 
 
@@ -117,52 +98,14 @@ def test_stats_count_and_start_anew():
     assert set(env.transform.stats().values()) == {0.0}
 
 
-def test_nothing_suitable_is_one_clear_line():
-    model = TensorDictModule(
-        lambda pixels, instruction: torch.full((len(pixels), 1), 0.532),
-        ["pixels", "instruction"],
-        ["suitability"],
-    )
-    world = CounterWorld((3,))
-    with pytest.raises(NothingSuitableError) as caught:
-        make(world=world, model=model, max_tries=7).reset()
-    message = str(caught.value)
-    for part in ("above 0.8", "7 states", "best score seen in this reset: 0.63", "lower threshold"):
-        assert part in message
-    assert "\n" not in message
-    assert world.resets.tolist() == [7, 7, 7]
-    assert isinstance(caught.value, UserError) and isinstance(caught.value, RuntimeError)
-
-
 def test_mode_of_the_classifier_is_left_alone():
     model = classifier().train()
-    env = make(model=model)
-    env.rollout(10, break_when_any_done=False)
-    assert model.training and model.module.dropout.training
-    env.eval()
-    assert model.training
-    model.eval()
-    env.train()
+    env = make(model=model).eval()
     env.reset()
+    assert model.training and model.module.dropout.training
+    model.eval()
+    env.train().reset()
     assert not model.training
-
-
-def test_specs_are_those_of_an_instructed_environment():
-    model = TensorDictModule(
-        lambda pixels, instruction: torch.full((len(pixels), 1), 9.0),
-        ["pixels", "instruction"],
-        ["suitability"],
-    )
-    world = PickAndPlaceEnv("move", num_envs=5, seed=0, instructed=False)
-    env = make(world=world, model=model, pool=torch.ones(1, 16).long())
-    instructed = PickAndPlaceEnv("move", num_envs=5, seed=0)
-    assert env.observation_spec["instruction"] == instructed.observation_spec["instruction"]
-    assert env.state_spec["instruction"] == env.observation_spec["instruction"]
-    assert make().observation_spec["instruction"].high.max() == 10
-    small = CounterWorld((4,))
-    small.vocabulary_size = 5
-    with pytest.raises(UserError, match="token id 10, but the environment's vocabulary has 5 ids"):
-        _ = make(world=small).observation_spec
 
 
 def test_environments_that_show_their_state_are_refused():
@@ -192,12 +135,6 @@ def test_stepping_without_an_instruction_says_so():
         env.step(go_up(tensordict))
 
 
-@pytest.mark.parametrize("options", [{"max_tries": 0}, {"threshold": 2.0}, {"choose": "first"}])
-def test_impossible_options(options):
-    with pytest.raises(UserError):
-        make(**options)
-
-
 def test_called_on_states_it_chooses_for_each():
     world = CounterWorld((10,))
     states = world.reset().select("pixels").view(2, 5)
@@ -209,11 +146,39 @@ def test_called_on_states_it_chooses_for_each():
 
 
 def test_another_classifier_may_take_the_place_of_the_first():
-    env = make()
-    env.transform.classifier = TensorDictModule(
-        lambda pixels, instruction: torch.full((len(pixels), 1), -9.0),
-        ["pixels", "instruction"],
-        ["suitability"],
-    )
+    env = make(max_tries=2)
+    env.transform.classifier = constant(-9.0)
     with pytest.raises(NothingSuitableError):
         env.reset()
+
+
+def test_nothing_suitable_is_one_clear_line():
+    world = CounterWorld((3,))
+    with pytest.raises(NothingSuitableError) as caught:
+        make(world=world, model=constant(0.532), max_tries=7).reset()
+    message = str(caught.value)
+    for part in ("above 0.8", "7 states", "best score seen in this reset: 0.63", "lower threshold"):
+        assert part in message
+    assert "\n" not in message
+    assert world.resets.tolist() == [7, 7, 7]
+    assert isinstance(caught.value, UserError) and isinstance(caught.value, RuntimeError)
+
+
+def test_impossible_options_are_refused_at_once():
+    with pytest.raises(UserError, match="max_tries must be at least 1"):
+        make(max_tries=0)
+    with pytest.raises(UserError, match="threshold is a probability"):
+        make(threshold=2.0)
+
+
+def test_specs_are_those_of_an_instructed_environment():
+    world = PickAndPlaceEnv("move", num_envs=5, seed=0, instructed=False)
+    env = make(world=world, model=constant(9.0), pool=torch.ones(1, 16).long())
+    instructed = PickAndPlaceEnv("move", num_envs=5, seed=0)
+    assert env.observation_spec["instruction"] == instructed.observation_spec["instruction"]
+    assert env.state_spec["instruction"] == env.observation_spec["instruction"]
+    assert make().observation_spec["instruction"].high.max() == 10
+    small = CounterWorld((4,))
+    small.vocabulary_size = 5
+    with pytest.raises(UserError, match="token id 10, but the environment's vocabulary has 5 ids"):
+        _ = make(world=small).observation_spec

@@ -6,134 +6,43 @@ and ``gymnasium.make_vec("ifo_grounding/Pick-v0", num_envs=256)``.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ifo_grounding.envs.gymnasium_shared import (
-    Observation,
-    act,
-    check_options,
-    draw_frames,
-    make_simulator,
-    make_spaces,
-    observe,
-    scene_numbers,
-    seed_stream,
-    sentences,
-)
+from ifo_grounding import keys
+from ifo_grounding.envs.simulator import Simulator, check_actions
 from ifo_grounding.envs.window import Window
 from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.tasks.scenes import SceneOptions
+from ifo_grounding.tasks.vocabulary import VOCABULARY
 
 RENDER_FPS = 8
 TEXT = "instruction_text"
 SUCCESS = "is_success"
+OPTIONS = sorted({f.name for f in dataclasses.fields(SceneOptions)} - {"task", "instructed"})
 
-
-class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
-    """One pick-and-place world with an instruction.
-
-    Observations hold ``pixels``, uint8 [3, H, W], and ``instruction``, int64 [16]; the sentence is
-    in ``info["instruction_text"]``, and ``info["is_success"]`` is there when an episode ends. The
-    reward is 1 for an episode that ends with its instruction fulfilled, else 0. A seeded reset goes
-    to the first scene of the seed's stream and further resets follow the stream;
-    ``reset(options={"scene": 7})`` begins with that scene of it.
-
-    Args:
-        task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
-        tile_size: pixels along one side of a cell in ``pixels``: 8, 16 or 32.
-        render_mode: None, ``rgb_array`` or ``human`` (a window; needs pygame, not a screen).
-        device: where the world lives.
-        scene_options: fields of :class:`~ifo_grounding.tasks.SceneOptions`: ``split``,
-            ``holdout``, ``holdout_visible``, ``stream``, ``layout``, ``max_steps``.
-
-    Raises:
-        UserError: on an unknown name or an impossible size.
-        TypeError: on an unknown scene option.
-
-    >>> env = PickAndPlaceGymEnv("move")
-    >>> observation, info = env.reset(seed=0)
-    >>> observation["pixels"].shape, info["instruction_text"][:12]
-    ((3, 48, 48), 'move to the ')
-    """
-
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}  # noqa: RUF012
-
-    def __init__(
-        self,
-        task: str = "move",
-        *,
-        tile_size: int = 8,
-        render_mode: str | None = None,
-        device: torch.device | str | None = None,
-        **scene_options: Any,
-    ) -> None:
-        check_choice("render mode", render_mode, (None, *self.metadata["render_modes"]))
-        self.render_mode = render_mode
-        self._simulator = make_simulator(task, 1, tile_size, device, scene_options)
-        self.observation_space, self.action_space = make_spaces(self._simulator)
-        self._text = ""
-        self._row = torch.zeros(1, dtype=torch.int64, device=self._simulator.device)
-        self._window = Window(RENDER_FPS) if render_mode == "human" else None
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Begin the next episode of the stream, or the first one of ``seed``."""
-        super().reset(seed=seed)
-        scene = check_options(options, ("scene",)).get("scene")
-        seed_stream(self._simulator, seed, self.np_random)
-        number = None if scene is None else scene_numbers(scene, 1, self._simulator.device)
-        self._simulator.reset(self._row, number)
-        self._text = sentences(self._simulator.instruction)[0]
-        self._show()
-        return self._observe(), {TEXT: self._text}
-
-    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take one action, 0..5."""
-        success, terminated, truncated = (
-            bool(flag[0]) for flag in act(self._simulator, np.reshape(action, (-1,)))
-        )
-        info: dict[str, Any] = {TEXT: self._text}
-        if terminated or truncated:
-            info[SUCCESS] = success
-        self._show()
-        return self._observe(), float(success), terminated, truncated, info
-
-    def render(self) -> np.ndarray | None:
-        """Draw the world, uint8 [H, W, 3]; in mode ``human`` show it in the window instead."""
-        if self.render_mode == "rgb_array":
-            return draw_frames(self._simulator)[0]
-        self._show()
-        return None
-
-    def close(self) -> None:
-        """Close the window."""
-        if self._window is not None:
-            self._window.close()
-
-    def _observe(self) -> Observation:
-        return {name: value[0] for name, value in observe(self._simulator).items()}
-
-    def _show(self) -> None:
-        if self._window is not None:
-            self._window.show(draw_frames(self._simulator)[0], self._text)
+Observation = dict[str, np.ndarray]
 
 
 class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
     """Pick-and-place worlds side by side, all moved by one batched simulator.
 
-    Spaces and entries are those of :class:`PickAndPlaceGymEnv`, batched; infos have Gymnasium's
-    vector format. A seeded reset begins with the first ``num_envs`` scenes of the seed's stream,
-    and every world that ends goes on with the stream's next scene.
+    Observations hold ``pixels``, uint8 [N, 3, H, W], and ``instruction``, int64 [N, 16]; sentences
+    are in ``infos["instruction_text"]``, and ``infos["is_success"]`` is there when an episode ends.
+    The reward is 1 for an episode that ends with its instruction fulfilled, else 0. A seeded reset
+    begins with the first scenes of the seed's stream, and every world that ends goes on with its
+    next one; ``reset(options={"scene": numbers})`` begins with numbered ones, int [N].
 
     Args:
         task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
-        num_envs: worlds side by side.
+        num_envs: worlds side by side, N.
         tile_size: pixels along one side of a cell in ``pixels``: 8, 16 or 32.
         render_mode: None or ``rgb_array``.
         autoreset_mode: when a world that ended begins anew: at the next step (Gymnasium's
@@ -141,7 +50,8 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
             its infos in ``infos["final_info"]``), or only by ``reset(options={"reset_mask": ...})``
             with a bool [num_envs] (``AutoresetMode.DISABLED``).
         device: where the worlds live; observations are NumPy arrays in any case.
-        scene_options: as for :class:`PickAndPlaceGymEnv`.
+        scene_options: fields of :class:`~ifo_grounding.tasks.SceneOptions`: ``split``,
+            ``holdout``, ``holdout_visible``, ``stream``, ``layout``, ``max_steps``.
 
     Raises:
         UserError: on an unknown name or an impossible size.
@@ -167,15 +77,27 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         check_choice("render mode", render_mode, (None, "rgb_array"))
         if not isinstance(autoreset_mode, AutoresetMode):
             check_choice("autoreset mode", autoreset_mode, [mode.value for mode in AutoresetMode])
+        if unknown := sorted(set(scene_options) - set(OPTIONS)):
+            # A TypeError in Python's words: clients such as GymEnv read it and try without.
+            raise TypeError(
+                f"__init__() got an unexpected keyword argument {unknown[0]!r}: scene options are "
+                + ", ".join(OPTIONS)
+            )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": RENDER_FPS,
             "autoreset_mode": self.autoreset_mode,
         }
+        given = {name: value for name, value in scene_options.items() if value is not None}
+        self._simulator = Simulator(SceneOptions(task, **given), num_envs, 0, tile_size, device)
         self.render_mode, self.num_envs = render_mode, num_envs
-        self._simulator = make_simulator(task, num_envs, tile_size, device, scene_options)
-        self.single_observation_space, self.single_action_space = make_spaces(self._simulator)
+        side = self._simulator.options.layout.size * tile_size
+        words = Box(0, len(VOCABULARY) - 1, (VOCABULARY.length,), np.int64)
+        self.single_observation_space = Dict(
+            {keys.PIXELS: Box(0, 255, (3, side, side), np.uint8), keys.INSTRUCTION: words}
+        )
+        self.single_action_space = Discrete(keys.N_ACTIONS)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._texts = np.full(num_envs, "", dtype=object)
@@ -186,16 +108,21 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin new episodes in all worlds, or in those of ``options["reset_mask"]``."""
         super().reset(seed=seed)
-        known = check_options(options, ("scene", "reset_mask"))
-        mask = np.asarray(known.get("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
+        options = options or {}
+        for name in options:
+            check_choice("reset option", name, ("scene", "reset_mask"))
+        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise UserError(
                 f"options['reset_mask'] must be bool [{self.num_envs}], "
                 f"got {mask.dtype} {list(mask.shape)}"
             )
-        seed_stream(self._simulator, seed, self.np_random)
-        self._begin(mask, known.get("scene"))
-        return observe(self._simulator), {TEXT: self._texts.copy(), f"_{TEXT}": mask.copy()}
+        if seed is not None:
+            self._simulator.seed(seed)
+        elif not self._simulator.started:
+            self._simulator.seed(int(self.np_random.integers(2**31)))
+        self._begin(mask, options.get("scene"))
+        return self._observe(), {TEXT: self._texts.copy(), f"_{TEXT}": mask.copy()}
 
     def step(
         self, actions: np.ndarray
@@ -203,6 +130,7 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         """Take one action in each world, int [num_envs].
 
         Raises:
+            ResetNeeded: before the first reset.
             UserError: on bad actions, and on worlds that ended and were not reset
                 (``AutoresetMode.DISABLED``).
         """
@@ -211,31 +139,54 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
             raise UserError(
                 f"{stale.sum()} worlds have ended: reset them by options['reset_mask'] first"
             )
-        success, terminated, truncated = act(self._simulator, np.asarray(actions))
+        success, terminated, truncated = self._act(actions)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             success, terminated, truncated = (
                 flag & ~stale for flag in (success, terminated, truncated)
             )
             self._begin(stale)
-        ended = terminated | truncated
-        self._ended = ended
-        observations = observe(self._simulator)
-        outcome = {SUCCESS: success.copy(), f"_{SUCCESS}": ended.copy()} if ended.any() else {}
+        self._ended = ended = terminated | truncated
+        observations = self._observe()
         infos: dict[str, Any] = {}
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and outcome:
-            infos = self._final(observations, ended, outcome)
-            self._begin(ended)
-            for name, fresh in observe(self._simulator, np.flatnonzero(ended)).items():
-                observations[name][ended] = fresh
-        else:
-            infos = outcome
+        if ended.any():
+            infos = {SUCCESS: success.copy(), f"_{SUCCESS}": ended.copy()}
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                infos = self._final(observations, ended, infos)
+                self._begin(ended)
+                for name, fresh in self._observe(np.flatnonzero(ended)).items():
+                    observations[name][ended] = fresh
         infos[TEXT] = self._texts.copy()
         infos[f"_{TEXT}"] = np.ones(self.num_envs, dtype=np.bool_)
         return observations, success.astype(np.float64), terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw each world, uint8 [H, W, 3], in mode ``rgb_array``."""
-        return tuple(draw_frames(self._simulator)) if self.render_mode == "rgb_array" else None
+        return tuple(self._frames()) if self.render_mode == "rgb_array" else None
+
+    def _act(self, actions: np.ndarray) -> list[np.ndarray]:
+        """Step all worlds; return success, terminated and truncated, bool [N] each."""
+        if not self._simulator.started:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        given = torch.from_numpy(np.ascontiguousarray(actions))
+        check_actions(given, self.num_envs, keys.N_ACTIONS)
+        outcome = self._simulator.step(given.to(self._simulator.device, torch.int64))
+        return [flag.cpu().numpy() for flag in outcome]
+
+    def _observe(self, rows: np.ndarray | None = None) -> Observation:
+        """Return what all worlds show, or those of ``rows``, in new arrays."""
+        simulator = self._simulator
+        index = None if rows is None else torch.from_numpy(rows).to(simulator.device)
+        tokens = simulator.instruction.clone() if index is None else simulator.instruction[index]
+        return {
+            keys.PIXELS: simulator.pixels(index).cpu().numpy(),
+            keys.INSTRUCTION: tokens.cpu().numpy(),
+        }
+
+    def _frames(self) -> np.ndarray:
+        """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
+        if not self._simulator.started:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        return self._simulator.frames()
 
     def _begin(self, mask: np.ndarray, scenes: Any = None) -> None:
         """Begin new episodes where ``mask``, with the given scenes [num_envs] or the next ones."""
@@ -244,9 +195,14 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         rows = torch.from_numpy(np.flatnonzero(mask)).to(self._simulator.device)
         numbers = None
         if scenes is not None:
-            numbers = scene_numbers(scenes, self.num_envs, self._simulator.device)[rows]
+            given = np.atleast_1d(np.asarray(scenes))
+            if given.shape != (self.num_envs,) or not np.issubdtype(given.dtype, np.integer):
+                raise UserError(
+                    f"options['scene'] must be integers, one for each of {self.num_envs} worlds"
+                )
+            numbers = torch.from_numpy(given.astype(np.int64)[mask]).to(self._simulator.device)
         self._simulator.reset(rows, numbers)
-        self._texts[mask] = sentences(self._simulator.instruction[rows])
+        self._texts[mask] = VOCABULARY.decode(self._simulator.instruction[rows].cpu())
         self._ended = self._ended & ~mask
 
     def _final(
@@ -258,10 +214,78 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
             last[row] = {name: value[row].copy() for name, value in observations.items()}
         texts = self._texts.copy()
         texts[~ended] = None
-        final_info = {**outcome, TEXT: texts, f"_{TEXT}": ended.copy()}
         return {
             "final_obs": last,
             "_final_obs": ended.copy(),
-            "final_info": final_info,
+            "final_info": {**outcome, TEXT: texts, f"_{TEXT}": ended.copy()},
             "_final_info": ended.copy(),
         }
+
+
+class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
+    """One pick-and-place world with an instruction: a row of :class:`PickAndPlaceVectorEnv`.
+
+    Args:
+        task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
+        render_mode: None, ``rgb_array`` or ``human`` (a window; needs pygame, not a screen).
+        options: ``tile_size``, ``device`` and scene options, as for many worlds.
+
+    Raises:
+        UserError: on an unknown name or an impossible size.
+        TypeError: on an unknown scene option.
+
+    >>> env = PickAndPlaceGymEnv("move")
+    >>> observation, info = env.reset(seed=0)
+    >>> observation["pixels"].shape, info["instruction_text"][:12]
+    ((3, 48, 48), 'move to the ')
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}  # noqa: RUF012
+
+    def __init__(
+        self, task: str = "move", *, render_mode: str | None = None, **options: Any
+    ) -> None:
+        check_choice("render mode", render_mode, (None, *self.metadata["render_modes"]))
+        self.render_mode = render_mode
+        self._worlds = PickAndPlaceVectorEnv(task, 1, **options)
+        self.observation_space = self._worlds.single_observation_space
+        self.action_space = self._worlds.single_action_space
+        self._window = Window(RENDER_FPS) if render_mode == "human" else None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin the next episode of the stream, or the first one of ``seed``."""
+        super().reset(seed=seed)
+        self._worlds.np_random = self.np_random
+        observations, infos = self._worlds.reset(seed=seed, options=options)
+        self._show()
+        first = {name: value[0] for name, value in observations.items()}
+        return first, {TEXT: infos[TEXT][0]}
+
+    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Take one action, 0..5."""
+        outcome = self._worlds._act(np.reshape(action, (-1,)))
+        success, terminated, truncated = (bool(flag[0]) for flag in outcome)
+        info: dict[str, Any] = {TEXT: self._worlds._texts[0]}
+        if terminated or truncated:
+            info[SUCCESS] = success
+        self._show()
+        observation = {name: value[0] for name, value in self._worlds._observe().items()}
+        return observation, float(success), terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """Draw the world, uint8 [H, W, 3]; in mode ``human`` show it in the window instead."""
+        if self.render_mode == "rgb_array":
+            return self._worlds._frames()[0]
+        self._show()
+        return None
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._window.close()
+
+    def _show(self) -> None:
+        if self._window is not None:
+            self._window.show(self._worlds._frames()[0], self._worlds._texts[0])

@@ -10,24 +10,21 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Composite
 
 from ifo_grounding import keys
-from ifo_grounding.envs.simulator import Simulator
-from ifo_grounding.errors import UserError, at_least_one, check_choice
+from ifo_grounding.envs.base import DONE, NumberedEnv
+from ifo_grounding.envs.simulator import RENDER_TILE_SIZE, Simulator
+from ifo_grounding.errors import UserError
 from ifo_grounding.tasks.goals import MAX_STEPS
 from ifo_grounding.tasks.scenes import Scene, SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import N_BOXES, N_KINDS, Layout
-from ifo_grounding.world.tiles import TILE_SIZES
 
-RENDER_TILE_SIZE = 32
 STATE = "state"
-DONE = ("done", "terminated", "truncated")
 
 
-class PickAndPlaceEnv(EnvBase):
+class PickAndPlaceEnv(NumberedEnv):
     """A batch of 6x6 pick-and-place worlds with instructions.
 
     An episode ends when the policy stops (terminated) or after ``max_steps`` actions (truncated);
@@ -67,10 +64,6 @@ class PickAndPlaceEnv(EnvBase):
 
     stop_action = keys.STOP
     """The action by which a policy ends an episode."""
-    steps_on = True
-    """A world may be stepped after an end, as if there had been none."""
-    vocabulary = VOCABULARY
-    """Words of the instructions."""
 
     def __init__(
         self,
@@ -89,9 +82,7 @@ class PickAndPlaceEnv(EnvBase):
         layout: Layout | None = None,
         max_steps: int = MAX_STEPS,
     ) -> None:
-        check_choice("tile size", tile_size, TILE_SIZES)
-        num_envs = at_least_one("num_envs", num_envs)
-        self.options = SceneOptions(
+        options = SceneOptions(
             task=task,
             instructed=instructed,
             split=split,
@@ -101,14 +92,19 @@ class PickAndPlaceEnv(EnvBase):
             layout=layout or Layout(),
             max_steps=max_steps,
         )
-        super().__init__(device=device or "cpu", batch_size=[num_envs])
-        self.num_envs, self.tile_size = num_envs, tile_size
-        self.expose_state, self.instructed = expose_state, instructed
-        self.vocabulary_size, self.instruction_length = len(VOCABULARY), VOCABULARY.length
+        super().__init__(num_envs, VOCABULARY, instructed, device)
+        self.tile_size, self.expose_state = tile_size, expose_state
         seed = secrets.randbits(31) if seed is None else seed
-        self._simulator = Simulator(self.options, num_envs, seed, tile_size, self.device)
+        self._simulator = Simulator(options, num_envs, seed, tile_size, self.device)
         self._shown = [keys.PIXELS, keys.INSTRUCTION] if instructed else [keys.PIXELS]
-        self._make_specs()
+        side = options.layout.size * tile_size
+        state = {STATE: self._state_spec()} if expose_state else {}
+        self._declare((3, side, side), keys.N_ACTIONS, **state)
+
+    @property
+    def options(self) -> SceneOptions:
+        """Which scenes."""
+        return self._simulator.options
 
     @property
     def task(self) -> str:
@@ -122,7 +118,7 @@ class PickAndPlaceEnv(EnvBase):
 
     @stream.setter
     def stream(self, stream: str) -> None:
-        self.options = self._simulator.options = dataclasses.replace(self.options, stream=stream)
+        self._simulator.options = dataclasses.replace(self.options, stream=stream)
 
     @property
     def scene_numbers(self) -> Tensor:
@@ -148,58 +144,19 @@ class PickAndPlaceEnv(EnvBase):
         self._simulator.to(self.device)
         return self
 
-    def _make_specs(self) -> None:
-        batch, device = tuple(self.batch_size), self.device
-        side = self.options.layout.size * self.tile_size
-        observation = Composite(shape=batch, device=device)
-        observation[keys.PIXELS] = Bounded(
-            0, 255, shape=(*batch, 3, side, side), dtype=torch.uint8, device=device
-        )
-        if self.instructed:
-            observation[keys.INSTRUCTION] = Bounded(
-                0,
-                self.vocabulary_size - 1,
-                shape=(*batch, self.instruction_length),
-                dtype=torch.int64,
-                device=device,
-            )
-        if self.expose_state:
-            observation[STATE] = self._world_spec()
-        self.observation_spec = observation
-        self.action_spec = Categorical(keys.N_ACTIONS, shape=batch, device=device)
-        self.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
-        flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            {name: flag.clone() for name in DONE},
-            shape=batch,
-            device=device,
-        )
-
-    def _world_spec(self) -> Composite:
-        batch, cells = tuple(self.batch_size), self.options.layout.size**2
-
-        def bounded(high: int, dtype: torch.dtype, *shape: int) -> Bounded:
-            return Bounded(0, high, shape=(*batch, *shape), dtype=dtype, device=self.device)
-
-        return Composite(
-            arm=bounded(cells - 1, torch.int64),
-            held=bounded(N_KINDS, torch.uint8),
-            objects=bounded(N_KINDS, torch.uint8, cells),
-            boxes=bounded(N_BOXES, torch.uint8, cells),
-            shape=batch,
-            device=self.device,
-        )
+    def _state_spec(self) -> Composite:
+        cells = self.options.layout.size**2
+        parts = {
+            "arm": self._bounded(cells - 1),
+            "held": self._bounded(N_KINDS, dtype=torch.uint8),
+            "objects": self._bounded(N_KINDS, cells, dtype=torch.uint8),
+            "boxes": self._bounded(N_BOXES, cells, dtype=torch.uint8),
+        }
+        return Composite(parts, shape=self.batch_size, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None or not self._simulator.started:
-            rows = torch.arange(self.num_envs, device=self.device)
-        else:
-            rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
-        given = self._empty() if tensordict is None else tensordict
-        numbers = given.get(keys.SCENE, None)
-        if numbers is not None:
-            numbers = numbers.reshape(self.num_envs)[rows]
+        given: Any = {} if tensordict is None else tensordict
+        rows, numbers = self._asked(tensordict, self._simulator.started)
         self._simulator.reset(rows, numbers)
         tokens = given.get(keys.INSTRUCTION, None) if self.instructed else None
         # The instruction of an observation is over.
@@ -216,7 +173,8 @@ class PickAndPlaceEnv(EnvBase):
         """Keep what the reset shows of all rows, new and running ones.
 
         EnvBase chooses between old and new pixel by pixel, which takes longer than all else in a
-        step. Entries of others are blank where an episode begins, as EnvBase leaves them.
+        step. Done flags, actions and entries of others are blank where an episode begins, as
+        EnvBase leaves them.
         """
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if tensordict is None or mask is None or self.expose_state:
@@ -229,7 +187,6 @@ class PickAndPlaceEnv(EnvBase):
         begins = mask.reshape(self.num_envs)
 
         def blank(value: Tensor) -> Tensor:
-            """Forget what an episode left that is over: done flags, actions, entries of others."""
             return value.masked_fill(begins.view(-1, *[1] * (value.ndim - 1)), 0)
 
         return tensordict.exclude("_reset", *self._shown).apply(blank).update(merged)
@@ -256,11 +213,8 @@ class PickAndPlaceEnv(EnvBase):
                 "TensorDict of 'scene' (env.scene_numbers for the same scenes) and 'instruction'"
             )
 
-    def _empty(self) -> TensorDict:
-        return TensorDict({}, batch_size=self.batch_size, device=self.device)
-
     def _observe(self) -> TensorDict:
-        result = self._empty()
+        result = TensorDict({}, batch_size=self.batch_size, device=self.device)
         result[keys.PIXELS] = self._simulator.pixels()
         if self.instructed:
             result[keys.INSTRUCTION] = self._simulator.instruction.clone()
@@ -273,4 +227,4 @@ class PickAndPlaceEnv(EnvBase):
 
     def render(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
         """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
-        return self._simulator.pixels(tile_size=tile_size).permute(0, 2, 3, 1).cpu().numpy()
+        return self._simulator.frames(tile_size)

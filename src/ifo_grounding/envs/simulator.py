@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ifo_grounding import keys
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.tasks.goals import Plan, fulfilled, plan
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import Scene, SceneOptions, leaves
 from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.world import Canvas, WorldState, render, step
+from ifo_grounding.world.tiles import TILE_SIZES
+
+RENDER_TILE_SIZE = 32
+"""Pixels along one side of a cell in pictures for people."""
 
 
 def check_actions(action: Tensor, worlds: int, count: int) -> None:
@@ -33,27 +38,14 @@ def check_actions(action: Tensor, worlds: int, count: int) -> None:
             )
 
 
-def scene_numbers(numbers: Tensor) -> Tensor:
-    """Return numbers of scenes [N] as int64, or refuse what are none."""
-    if numbers.is_floating_point() or numbers.dtype == torch.bool:
-        raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
-    if len(numbers) and int(numbers.min()) < 0:
-        raise UserError("scene numbers start at 0")
-    return numbers.long()
-
-
 class Simulator:
     """Runs ``num_envs`` episodes of numbered scenes side by side.
 
     What it keeps is no inference tensor, so that episodes go on outside ``torch.inference_mode``
     that began inside.
 
-    Args:
-        options: which scenes.
-        num_envs: episodes side by side.
-        seed: seed of the stream of scenes.
-        tile_size: pixels along one side of a cell.
-        device: where the worlds live.
+    Raises:
+        UserError: on an impossible number or size.
     """
 
     @torch.inference_mode(False)
@@ -65,6 +57,8 @@ class Simulator:
         tile_size: int = 8,
         device: torch.device | str | None = None,
     ) -> None:
+        check_choice("tile size", tile_size, TILE_SIZES)
+        at_least_one("num_envs", num_envs)
         self.options, self.num_envs, self.tile_size = options, num_envs, tile_size
         self.device = torch.device(device or "cpu")
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
@@ -81,9 +75,7 @@ class Simulator:
     @torch.inference_mode(False)
     def to(self, device: torch.device | str) -> Simulator:
         """Move the running episodes and all that follow to a device."""
-        if (device := torch.device(device)) == self.device:
-            return self
-        self.device = device
+        self.device = torch.device(device)
         self.steps, self.numbers = self.steps.to(self.device), self.numbers.to(self.device)
         if self._episodes is not None:
             scene = self.scene.to(self.device)
@@ -106,8 +98,7 @@ class Simulator:
     def scene(self) -> Scene:
         """The worlds as they are, with what they are asked, [num_envs]."""
         now = self._running
-        parts = {"state": now.state, "wanted": now.wanted, "instruction": now.instruction}
-        return Scene(**parts, batch_size=[self.num_envs])
+        return Scene(now.state, now.wanted, now.instruction, batch_size=[self.num_envs])
 
     @property
     def instruction(self) -> Tensor:
@@ -122,15 +113,8 @@ class Simulator:
 
     @torch.inference_mode(False)
     def reset(self, rows: Tensor, numbers: Tensor | None = None) -> None:
-        """Begin new episodes in some rows.
-
-        Args:
-            rows: which, int64 [R].
-            numbers: numbers of the scenes to begin with, int64 [R]; by default the stream's next.
-        """
-        if numbers is not None:
-            numbers = scene_numbers(numbers)
-        else:
+        """Begin new episodes in some rows, int64 [R], by default with the stream's next scenes."""
+        if numbers is None:
             first = self.next_number
             numbers = torch.arange(first, first + len(rows), device=self.device)
             self.next_number += len(rows)
@@ -176,12 +160,15 @@ class Simulator:
         return ended & fulfilled(state, self._running.wanted), terminated, truncated
 
     @torch.inference_mode(False)
-    def pixels(self, rows: Tensor | None = None, tile_size: int | None = None) -> Tensor:
+    def pixels(self, rows: Tensor | None = None) -> Tensor:
         """Draw some rows or all of them, uint8 [R, 3, H, W]."""
-        if rows is None and tile_size is None:
+        if rows is None:
             return self._canvas.draw(self.state)
-        state = self.state if rows is None else self.state[rows]
-        return render(state, tile_size or self.tile_size)
+        return render(self.state[rows], self.tile_size)
+
+    def frames(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
+        """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
+        return render(self.state, tile_size).permute(0, 2, 3, 1).cpu().numpy()
 
 
 class _Episodes:

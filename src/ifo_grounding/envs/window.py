@@ -6,6 +6,7 @@ import os
 from typing import Any
 
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 
 LINE_HEIGHT = 32
 LINE_COLOUR = (235, 235, 235)
@@ -26,8 +27,6 @@ class Window:
         try:
             import pygame
         except ImportError as error:
-            from gymnasium.error import DependencyNotInstalled
-
             raise DependencyNotInstalled(
                 "render_mode 'human' needs pygame: pip install 'ifo-grounding[human]'"
             ) from error
@@ -51,10 +50,6 @@ class Window:
         pygame.event.pump()
         pygame.display.flip()
         self._clock.tick(self.fps)
-
-    def pixels(self) -> np.ndarray:
-        """Return what the window shows, uint8 [H, W, 3]."""
-        return self._pygame.surfarray.array3d(self._surface).swapaxes(0, 1)
 
     def close(self) -> None:
         """Close the window; a later :meth:`show` opens it again."""

@@ -10,20 +10,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.envs.reading import ADD, ENDED, Read, Reading
-from ifo_grounding.envs.simulator import check_actions, scene_numbers
-from ifo_grounding.errors import UserError, at_least_one, check_choice
+from ifo_grounding.envs.base import DONE, NumberedEnv
+from ifo_grounding.envs.reading import ADD, ENDED, Reading
+from ifo_grounding.envs.simulator import check_actions
+from ifo_grounding.errors import UserError, at_least_one, check_choice, whole
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
-
-FLAGS = ("done", "terminated", "truncated")
 
 Make = Callable[[], gymnasium.Env]
 
@@ -54,23 +50,22 @@ def from_gymnasium(
     Args:
         world: id for :func:`gymnasium.make`, or a function that makes the world (then give it all
             it needs, wrappers included).
-        vocabulary: the words of the instructions, that of the demonstrations.
+        vocabulary: that of the demonstrations.
         num_envs: worlds side by side.
         image: name of the image in the observation; None where the observation is the image.
         instruction: name of the sentence in the observation, or else in ``info``.
-        instructed: whether episodes show their instruction and pay their reward. Without, only
-            images are read, and an episode that the world ends counts as truncated: what the world
-            was asked for is no business of a learner.
+        instructed: whether episodes show their instruction and pay their reward. Without, an
+            episode that the world ends counts as truncated: what the world was asked for is no
+            business of a learner.
         stop: how a policy says that it is done: the number of the action that ends an episode; or,
             where none does, of one that does nothing, such as MiniGrid's ``done`` (6), or ``"add"``
             for one more action that never reaches the world. It terminates the episode, and is the
             environment's ``stop_action``; close the demonstrations with
-            :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match. None: nothing that
-            a policy does ends an episode as far as a learner is told.
-        skip_unknown: whether words that the vocabulary does not hold are left out of instructions;
-            otherwise they are refused.
+            :meth:`~ifo_grounding.data.Demonstrations.close_episodes` to match. None: no action
+            ends an episode as far as a learner is told.
+        skip_unknown: whether unknown words are left out of instructions, or refused.
         processes: whether every world runs in a process of its own, for which a script needs its
-            ``if __name__ == "__main__":``, as all that begin processes do.
+            ``if __name__ == "__main__":``.
         seed: of the stream of scenes; random by default.
         stream: ``training``, ``validation`` or ``evaluation``: disjoint scenes.
         device: where tensors go.
@@ -94,30 +89,39 @@ def from_gymnasium(
     >>> env.reset()["pixels"].shape
     torch.Size([2, 3, 48, 48])
     """
+    check_choice("stream", stream, STREAMS)
+    if isinstance(stop, str):
+        check_choice("stop", stop, (ADD,))
+    elif stop is not None:
+        stop = whole("stop", stop)
+    if not isinstance(vocabulary, Vocabulary):
+        raise UserError(
+            "vocabulary is a Vocabulary, such as that of the demonstrations or "
+            f"Vocabulary.from_sentences(...), got {type(vocabulary).__name__}"
+        )
     if isinstance(world, str):
-        make: Make = functools.partial(gymnasium.make, world, **make_options)
+        world = functools.partial(gymnasium.make, world, **make_options)
     elif make_options:
         raise UserError(
             f"options {sorted(make_options)} are for a world made from its id: give them to it in "
             "your function"
         )
-    else:
-        make = world
-    return GymnasiumEnv(
-        make,
-        Reading(vocabulary, image, instruction, instructed, stop, skip_unknown),
-        num_envs,
-        processes=processes,
-        seed=seed,
-        stream=stream,
-        device=device,
-    )
+    if not callable(world):
+        raise UserError(
+            "a world is an id or a function that makes it, such as its class, got "
+            f"{type(world).__name__}"
+        )
+    reading = (vocabulary, image, instruction, instructed, stop, skip_unknown)
+    makes = [functools.partial(_open, world, *reading)] * at_least_one("num_envs", num_envs)
+    vector = AsyncVectorEnv if processes else SyncVectorEnv
+    worlds = vector(makes, autoreset_mode=AutoresetMode.DISABLED)
+    return GymnasiumEnv(worlds, vocabulary, instructed, stop, seed, stream, device)
 
 
-def _open(make: Make, reading: Reading) -> Read:
+def _open(make: Make, *reading: Any) -> Reading:
     env = make()
     try:
-        return Read(env, reading)
+        return Reading(env, *reading)
     except BaseException:
         if isinstance(env, gymnasium.Env):
             env.close()
@@ -129,96 +133,44 @@ def world_seed(seed: int, stream: str, number: int) -> int:
     return derive(seed, stream, number) % 2**31
 
 
-class GymnasiumEnv(EnvBase):
-    """What :func:`from_gymnasium` returns: worlds that ``make`` makes and ``reading`` reads."""
-
-    steps_on = True
-    """A row may be stepped after its end, to no effect."""
+class GymnasiumEnv(NumberedEnv):
+    """What :func:`from_gymnasium` returns: a vector of worlds as :class:`Reading` reads them."""
 
     def __init__(
         self,
-        make: Make,
-        reading: Reading,
-        num_envs: int,
-        *,
-        processes: bool = False,
-        seed: int | None = None,
-        stream: str = "training",
-        device: torch.device | str | None = None,
+        worlds: VectorEnv,
+        vocabulary: Vocabulary,
+        instructed: bool,
+        stop: int | str | None,
+        seed: int | None,
+        stream: str,
+        device: torch.device | str | None,
     ) -> None:
-        check_choice("stream", stream, STREAMS)
-        num_envs = at_least_one("num_envs", num_envs)
-        if not callable(make):
-            raise UserError(
-                "a world is an id or a function that makes it, such as its class, got "
-                f"{type(make).__name__}"
-            )
-        super().__init__(device=device or "cpu", batch_size=[num_envs])
-        vector = AsyncVectorEnv if processes else SyncVectorEnv
-        makes = [functools.partial(_open, make, reading)] * num_envs
-        self.worlds = vector(makes, autoreset_mode=AutoresetMode.DISABLED)
-        self.num_envs, self.instructed, self.stream = num_envs, reading.instructed, stream
-        self.vocabulary = reading.vocabulary
-        self.vocabulary_size = len(reading.vocabulary)
-        self.instruction_length = reading.vocabulary.length
-        self._numbers = torch.full((num_envs,), -1)
-        self._set_seed(seed)
-        self._make_specs()
-        self.stop_action = self.n_actions - 1 if reading.stop == ADD else reading.stop
-        """The action by which a policy ends an episode, or None."""
-
-    @property
-    def scene_numbers(self) -> Tensor:
+        super().__init__(worlds.num_envs, vocabulary, instructed, device)
+        self.worlds, self.stream = worlds, stream
+        self.scene_numbers = torch.full((self.num_envs,), -1)
         """Number of the scene that each row began with, int64 [num_envs]."""
-        return self._numbers
-
-    def _make_specs(self) -> None:
-        batch, device = tuple(self.batch_size), self.device
-        observation = Composite(shape=batch, device=device)
-        spaces = dict(self.worlds.single_observation_space)  # type: ignore[call-overload]
-        del spaces[ENDED]
-        for name, space in spaces.items():
-            observation[name] = Bounded(
-                0,
-                int(space.high.max()),
-                shape=(*batch, *space.shape),
-                dtype=torch.uint8 if name == keys.PIXELS else torch.int64,
-                device=device,
-            )
-        self.observation_spec = observation
-        self.n_actions = int(self.worlds.single_action_space.n)  # type: ignore[attr-defined]
-        self.action_spec = Categorical(self.n_actions, shape=batch, device=device)
-        self.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
-        flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            {name: flag.clone() for name in FLAGS}, shape=batch, device=device
-        )
+        self._set_seed(seed)
+        self.n_actions = int(worlds.single_action_space.n)  # type: ignore[attr-defined]
+        self.stop_action = self.n_actions - 1 if stop == ADD else stop
+        """The action by which a policy ends an episode, or None."""
+        pixels = worlds.single_observation_space[keys.PIXELS]  # type: ignore[index]
+        self._declare(pixels.shape, self.n_actions)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        begins = torch.ones(self.num_envs, dtype=torch.bool)
-        if mask is not None and int(self._numbers.min()) >= 0:
-            begins = mask.reshape(self.num_envs).cpu()
-        rows = begins.nonzero().squeeze(-1)
+        rows, numbers = self._asked(tensordict, started=int(self.scene_numbers.min()) >= 0)
         if len(rows):
-            asked = None if tensordict is None else tensordict.get(keys.SCENE, None)
-            numbers = (
-                self._next(len(rows))
-                if asked is None
-                else scene_numbers(asked.reshape(-1).cpu()[rows])
-            )
-            self._numbers = self._numbers.index_copy(0, rows, numbers)  # others may hold them
-            seeds: list[int | None] = [None] * self.num_envs
-            for row in rows.tolist():
-                seeds[row] = world_seed(self._seed, self.stream, int(self._numbers[row]))
-            seen, _ = self.worlds.reset(seed=seeds, options={"reset_mask": begins.numpy()})
-            self._seen = seen
-        return self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in FLAGS})
-
-    def _next(self, count: int) -> Tensor:
-        first = self._next_number
-        self._next_number += count
-        return torch.arange(first, first + count)
+            if numbers is None:
+                numbers = torch.arange(self._next_number, self._next_number + len(rows))
+                self._next_number += len(rows)
+            # A new tensor: others may hold the old one.
+            self.scene_numbers = self.scene_numbers.index_copy(0, rows.cpu(), numbers.cpu())
+            begins = np.zeros(self.num_envs, dtype=bool)
+            begins[rows.cpu()] = True
+            numbered = self.scene_numbers.tolist()
+            seeds: Any = [world_seed(self._seed, self.stream, number) for number in numbered]
+            self._seen, _ = self.worlds.reset(seed=seeds, options={"reset_mask": begins})
+        return self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in DONE})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get(keys.ACTION).cpu()
@@ -229,19 +181,15 @@ class GymnasiumEnv(EnvBase):
         terminated = terminated | stopped
         if not self.instructed:
             reward, terminated, truncated = np.zeros_like(reward), stopped, done & ~stopped
-        result = self._observed(done=done, terminated=terminated, truncated=truncated)
-        return result.set(keys.REWARD, self._column(reward.astype(np.float32)))
+        flags = {"done": done, "terminated": terminated, "truncated": truncated}
+        return self._observed(reward=reward.astype(np.float32), **flags)
 
-    def _observed(self, **flags: np.ndarray) -> TensorDict:
-        result = TensorDict({}, batch_size=self.batch_size, device=self.device)
-        for name in self.observation_spec.keys():  # noqa: SIM118
-            result[name] = torch.from_numpy(self._seen[name]).to(self.device)
-        for name, flag in flags.items():
-            result[name] = self._column(flag)
-        return result
-
-    def _column(self, values: np.ndarray) -> Tensor:
-        return torch.from_numpy(values).to(self.device).unsqueeze(-1)
+    def _observed(self, **columns: np.ndarray) -> TensorDict:
+        """Return what is seen, with columns [num_envs] beside it."""
+        seen = {name: self._seen[name] for name in self.observation_spec.keys()}  # noqa: SIM118
+        seen.update({name: column[:, None] for name, column in columns.items()})
+        tensors = {name: torch.from_numpy(array) for name, array in seen.items()}
+        return TensorDict(tensors, batch_size=self.batch_size, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = secrets.randbits(31) if seed is None else seed

@@ -179,10 +179,10 @@ def return_correlation(
 
         def add(rows: Tensor, transition: TensorDictBase) -> None:
             transition[keys.INITIAL_PIXELS] = first[rows]
-            paid, reached = reward.pay(transition, transition[keys.NEXT])
-            total[rows] += paid.reshape(-1).where(~arrived[rows], 0.0)
+            paid = reward.pay(transition, transition[keys.NEXT]).reshape(-1)
+            total[rows] += paid.where(~arrived[rows], 0.0)
             if reward.arrival is not None:  # where self-examination would end the episode
-                arrived[rows] |= reached.reshape(-1)
+                arrived[rows] |= paid > 0
 
         outcomes = player(env, start, on_step=add)
         return total / outcomes.lengths if average else total, outcomes.success

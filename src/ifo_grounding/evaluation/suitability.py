@@ -20,7 +20,7 @@ from ifo_grounding.tasks.grammar import FIELDS, grammar
 from ifo_grounding.tasks.scenes import SceneOptions
 from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY
-from ifo_grounding.transforms.choosing import PoolScorer, choose_instructions
+from ifo_grounding.transforms.choosing import PoolScorer
 from ifo_grounding.world import WorldState, render
 
 NOT_SERVED = -1
@@ -91,7 +91,7 @@ def suitable_rate(
 ) -> SuitabilityResult:
     """Let the instruction classifier choose for fresh simulator states, and ask the oracle.
 
-    Choices are made by :func:`~ifo_grounding.transforms.choose_instructions`, as in
+    Choices are made by :meth:`~ifo_grounding.transforms.PoolScorer.choose`, as in
     self-examination, except that each state is asked once: states that it does not serve count in
     ``served`` and nowhere else.
 
@@ -205,9 +205,7 @@ class _Examiner:
 
     def choices(self, state: WorldState, pixels: Tensor, **options: Any) -> CheckedChoices:
         """Let the classifier choose."""
-        index, score = choose_instructions(
-            self.scorer, None, pixels, generator=self.draw, **options
-        )
+        index, score = self.scorer.choose(pixels, generator=self.draw, **options)
         found = verdict(state, self.goals[index.clamp_min(0)], self.max_steps)
         return CheckedChoices(state, index, score, torch.where(index < 0, NOT_SERVED, found))
 

@@ -12,7 +12,8 @@ from tqdm import tqdm
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
 from ifo_grounding.seeding import generator
-from ifo_grounding.transforms.choosing import PoolScorer, check_pool, choose_instructions
+from ifo_grounding.transforms.base import check_pool
+from ifo_grounding.transforms.choosing import PoolScorer
 from ifo_grounding.transforms.sampler import NothingSuitableError
 from ifo_grounding.transforms.starts import FRAME_HASH, frame_hash
 
@@ -82,9 +83,7 @@ def select_pairs(
     with tqdm(total=n, desc="pairs", disable=not progress) as bar:
         while count < n:
             pixels = env.reset()[PIXELS].flatten(0, -4)
-            choices = choose_instructions(
-                scorer,
-                None,
+            choices = scorer.choose(
                 pixels,
                 threshold=threshold,
                 candidates=candidates,

@@ -1,6 +1,6 @@
 """Transforms of self-examination: an instruction for every episode, a reward for every step."""
 
-from ifo_grounding.transforms.choosing import Choices, PoolScorer, choose_instructions
+from ifo_grounding.transforms.choosing import Choices, PoolScorer
 from ifo_grounding.transforms.goal import GoalReward
 from ifo_grounding.transforms.reward import LearnedReward
 from ifo_grounding.transforms.sampler import InstructionSampler, NothingSuitableError
@@ -14,6 +14,5 @@ __all__ = [
     "NothingSuitableError",
     "PoolScorer",
     "StartingPairs",
-    "choose_instructions",
     "frame_hash",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -11,7 +13,7 @@ from torchrl.envs import Compose, EnvBase, Transform
 
 from ifo_grounding.attributes import attribute, innermost
 from ifo_grounding.errors import UserError
-from ifo_grounding.keys import INSTRUCTION
+from ifo_grounding.keys import INSTRUCTION, PIXELS
 
 
 def parts_of(transform: Transform) -> list[Transform]:
@@ -64,12 +66,23 @@ class InstructionTransform(EpisodeTransform):
 
     Subclasses write ``out_keys[0]`` in ``_reset``. Its spec has as many token ids as the
     environment declares in ``vocabulary_size``, or else as the instructions need.
+
+    Args:
+        tokens: all instructions that may be written, int64 [N, L].
+        in_keys: key of the image.
+        out_keys: key of the instruction.
     """
 
-    @property
-    def tokens(self) -> Tensor:
-        """All instructions that may be written, int64 [N, L]."""
-        raise NotImplementedError
+    tokens: Tensor
+
+    def __init__(
+        self,
+        tokens: Tensor,
+        in_keys: Sequence[NestedKey] | None,
+        out_keys: Sequence[NestedKey] | None,
+    ) -> None:
+        super().__init__(in_keys=in_keys or [PIXELS], out_keys=out_keys or [INSTRUCTION])
+        self.register_buffer("tokens", check_pool(tokens), persistent=False)
 
     def check_env(self, env: EnvBase) -> None:
         """Raise :class:`UserError` where an environment does not suit."""
@@ -102,11 +115,7 @@ class InstructionTransform(EpisodeTransform):
         )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Declare the instruction.
-
-        Raises:
-            UserError: where the environment does not suit or has an instruction already.
-        """
+        """Declare the instruction, in an environment that suits and has none."""
         if self.container is not None:
             self.check_env(self.container)
         key = self.out_keys[0]
@@ -137,12 +146,31 @@ def instructs(env: EnvBase) -> bool:
     return bool(attribute(env, "instructed", shows))
 
 
-def flat_logit(logit: Tensor, rows: int, name: NestedKey) -> Tensor:
-    """Check a model's output and return it as [rows].
+def check_pool(pool: Tensor) -> Tensor:
+    """Return ``pool`` if it is int64 [N, L] with N > 0, else raise :class:`UserError`."""
+    if not isinstance(pool, Tensor) or pool.ndim != 2 or pool.is_floating_point():
+        got = f"{pool.dtype} {list(pool.shape)}" if isinstance(pool, Tensor) else type(pool)
+        raise UserError(f"pool must be token ids, int64 [N, L], got {got}")
+    if not len(pool):
+        raise UserError("pool is empty: pass at least one instruction")
+    return pool.to(torch.int64)
 
-    Raises:
-        UserError: where its shape is not [rows, 1] or it is not a number.
-    """
+
+def rows_of(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return an entry of a tensordict [*B], its batch made one dimension."""
+    value = tensordict.get(key, None)
+    if value is None:
+        raise UserError(
+            f"a transform needs the entry {key!r}: the tensordict has "
+            f"{sorted(map(str, tensordict.keys(True, True)))}; collect with the transform on "
+            "the environment, or name other in_keys"
+        )
+    batch = tensordict.batch_size
+    return value.reshape(batch.numel(), *value.shape[len(batch) :])
+
+
+def flat_logit(logit: Tensor, rows: int, name: NestedKey) -> Tensor:
+    """Return a model's output as [rows], or raise :class:`UserError` where it is no such logit."""
     if logit.numel() != rows:
         raise UserError(f"{name!r} must have shape [{rows}, 1], got {list(logit.shape)}")
     if logit.isnan().any():

@@ -14,7 +14,7 @@ from torch import Tensor
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.keys import PIXELS, SUITABILITY
 from ifo_grounding.modules import device_of, evaluating, output_key
-from ifo_grounding.transforms.base import flat_logit
+from ifo_grounding.transforms.base import check_pool, flat_logit
 
 CHOICES = ("random", "best")
 AT_ONCE = 2048
@@ -35,7 +35,7 @@ class Choices(NamedTuple):
 
 
 class PoolScorer:
-    """Scores pairs of a state and an instruction of a pool.
+    """Scores pairs of a state and an instruction of a pool, and chooses among them.
 
     Where the classifier's network has ``encode_scenes``, ``encode_instruction`` and
     ``score_candidates``, each state and each instruction is encoded once: encodings of the pool are
@@ -48,6 +48,15 @@ class PoolScorer:
 
     Raises:
         UserError: on a classifier or a pool of another form.
+
+    >>> def same(pixels, instruction):  # suitable where the first token is the brightness
+    ...     equal = pixels.flatten(1)[:, :1] == instruction[:, :1]
+    ...     return equal * 8.0 - 4.0
+    >>> classifier = TensorDictModule(same, ["pixels", "instruction"], ["suitability"])
+    >>> scorer = PoolScorer(classifier, torch.tensor([[1], [2], [3]]))
+    >>> pixels = torch.tensor([3, 7, 1], dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 8, 8)
+    >>> scorer.choose(pixels).chosen.tolist()
+    [2, -1, 0]
     """
 
     def __init__(
@@ -131,19 +140,67 @@ class PoolScorer:
             self._encodings = torch.cat([network.encode_instruction(chunk) for chunk in chunks])
         return self._encodings
 
+    def choose(
+        self,
+        pixels: Tensor,
+        *,
+        threshold: float = 0.8,
+        candidates: int = 64,
+        choose: str = "random",
+        generator: torch.Generator | None = None,
+    ) -> Choices:
+        """Choose a suitable instruction for each state (paper, "Instruction Module").
+
+        Args:
+            pixels: states, uint8 [B, 3, H, W].
+            threshold: least probability of a suitable pair; 0.8 in the paper.
+            candidates: instructions drawn for each state; the whole pool if it is smaller.
+            choose: ``random`` among the suitable candidates, or the ``best`` of them.
+            generator: source of randomness, on the CPU.
+
+        Raises:
+            UserError: on impossible options, or logits of another shape.
+        """
+        check_options(threshold, candidates, choose)
+        limit = math.log(threshold / (1 - threshold)) if threshold else -math.inf
+        parts = []
+        for some in pixels.split(AT_ONCE):
+            index = draw_candidates(len(some), len(self.pool), candidates, generator)
+            parts.append(self._search(some, index.to(some.device), limit, choose == "best"))
+        return Choices(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+    def _search(self, pixels: Tensor, index: Tensor, limit: float, best: bool) -> Choices:
+        """Look at the candidates of each state in growing parts until one holds a suitable one.
+
+        The first suitable candidate of a random order is a random suitable one, so that most
+        candidates need no score. The best one is known when all are scored.
+        """
+        look = index.shape[1] if best else FIRST_LOOK
+        chosen = torch.full((len(pixels),), -1, dtype=torch.int64, device=pixels.device)
+        score = torch.full((len(pixels),), -math.inf, device=pixels.device)
+        waiting = torch.arange(len(pixels), device=pixels.device)
+        states = self.encode(pixels) if len(pixels) else pixels
+        home = device_of(self.classifier) or pixels.device
+        begin = 0
+        while len(waiting) and begin < index.shape[1]:
+            candidates = index[waiting, begin : begin + look]
+            logits = self.score(states[waiting.to(home)], candidates)
+            suitable = logits > limit
+            found = suitable.any(1)
+            place = logits.argmax(1)
+            if not best:
+                place = torch.where(found, suitable.int().argmax(1), place)
+            logit = logits.gather(1, place.unsqueeze(1)).squeeze(1)
+            picked = candidates.gather(1, place.unsqueeze(1)).squeeze(1)
+            chosen[waiting] = torch.where(found, picked, -1)
+            score[waiting] = torch.where(found, logit, torch.maximum(logit, score[waiting]))
+            waiting = waiting[~found]
+            begin, look = begin + look, 2 * look
+        return Choices(chosen, score.sigmoid())
+
     def __getstate__(self) -> dict[str, object]:
         """Leave the encodings behind: a copy makes its own."""
         return {**self.__dict__, "_encodings": None, "_weights": []}
-
-
-def check_pool(pool: Tensor) -> Tensor:
-    """Return ``pool`` if it is int64 [N, L] with N > 0, else raise :class:`UserError`."""
-    if not isinstance(pool, Tensor) or pool.ndim != 2 or pool.is_floating_point():
-        got = f"{pool.dtype} {list(pool.shape)}" if isinstance(pool, Tensor) else type(pool)
-        raise UserError(f"pool must be token ids, int64 [N, L], got {got}")
-    if not len(pool):
-        raise UserError("pool is empty: pass at least one instruction")
-    return pool.to(torch.int64)
 
 
 def check_options(threshold: float, candidates: int, choose: str) -> None:
@@ -163,85 +220,3 @@ def draw_candidates(
     """
     lots = torch.rand(states, pool_size, generator=generator)
     return lots.topk(min(candidates, pool_size), dim=1).indices
-
-
-def choose_instructions(
-    classifier: TensorDictModuleBase | PoolScorer,
-    pool: Tensor | None,
-    pixels: Tensor,
-    *,
-    threshold: float = 0.8,
-    candidates: int = 64,
-    choose: str = "random",
-    generator: torch.Generator | None = None,
-) -> Choices:
-    """Choose a suitable instruction of a pool for each state (paper, "Instruction Module").
-
-    Args:
-        classifier: TensorDictModule from (pixels, instruction) to the logit of suitability, or a
-            :class:`PoolScorer`, which remembers the pool and its encodings.
-        pool: token ids, int64 [N, L]; None with a :class:`PoolScorer`.
-        pixels: states, uint8 [B, 3, H, W].
-        threshold: least probability of a suitable pair; 0.8 in the paper.
-        candidates: instructions drawn for each state; the whole pool if it is smaller.
-        choose: ``random`` among the suitable candidates, or the ``best`` of them.
-        generator: source of randomness, on the CPU.
-
-    Returns:
-        Index into the pool, int64 [B], -1 where none was suitable, and its probability [B].
-
-    Raises:
-        UserError: on impossible options, or a classifier or pool of another form.
-
-    >>> from tensordict.nn import TensorDictModule, TensorDictModuleBase
-    >>> def same(pixels, instruction):  # suitable where the first token is the brightness
-    ...     equal = pixels.flatten(1)[:, :1] == instruction[:, :1]
-    ...     return equal * 8.0 - 4.0
-    >>> classifier = TensorDictModule(same, ["pixels", "instruction"], ["suitability"])
-    >>> pixels = torch.tensor([3, 7, 1], dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 8, 8)
-    >>> choose_instructions(classifier, torch.tensor([[1], [2], [3]]), pixels).chosen.tolist()
-    [2, -1, 0]
-    """
-    check_options(threshold, candidates, choose)
-    if isinstance(classifier, PoolScorer):
-        scorer = classifier
-    else:
-        if pool is None:
-            raise UserError("choose_instructions needs a pool of instructions")
-        scorer = PoolScorer(classifier, pool)
-    limit = math.log(threshold / (1 - threshold)) if threshold else -math.inf
-    parts = []
-    for some in pixels.split(AT_ONCE):
-        index = draw_candidates(len(some), len(scorer.pool), candidates, generator)
-        parts.append(_search(scorer, some, index.to(some.device), limit, best=choose == "best"))
-    return Choices(*(torch.cat(part) for part in zip(*parts, strict=True)))
-
-
-def _search(scorer: PoolScorer, pixels: Tensor, index: Tensor, limit: float, best: bool) -> Choices:
-    """Look at the candidates of each state in growing parts until one holds a suitable candidate.
-
-    The first suitable candidate of a random order is a random suitable one, so that most
-    candidates need no score. The best one is known when all are scored.
-    """
-    look = index.shape[1] if best else FIRST_LOOK
-    chosen = torch.full((len(pixels),), -1, dtype=torch.int64, device=pixels.device)
-    score = torch.full((len(pixels),), -math.inf, device=pixels.device)
-    waiting = torch.arange(len(pixels), device=pixels.device)
-    states = scorer.encode(pixels) if len(pixels) else pixels
-    home = device_of(scorer.classifier) or pixels.device
-    begin = 0
-    while len(waiting) and begin < index.shape[1]:
-        candidates = index[waiting, begin : begin + look]
-        logits = scorer.score(states[waiting.to(home)], candidates)
-        suitable = logits > limit
-        found = suitable.any(1)
-        place = logits.argmax(1)
-        if not best:
-            place = torch.where(found, suitable.int().argmax(1), place)
-        logit = logits.gather(1, place.unsqueeze(1)).squeeze(1)
-        picked = candidates.gather(1, place.unsqueeze(1)).squeeze(1)
-        chosen[waiting] = torch.where(found, picked, -1)
-        score[waiting] = torch.where(found, logit, torch.maximum(logit, score[waiting]))
-        waiting = waiting[~found]
-        begin, look = begin + look, 2 * look
-    return Choices(chosen, score.sigmoid())

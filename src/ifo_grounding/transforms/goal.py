@@ -13,6 +13,7 @@ from torchrl.data import Composite
 
 from ifo_grounding.errors import UserError, whole
 from ifo_grounding.keys import ACTION, GOAL_SCORE, INITIAL_PIXELS, PIXELS
+from ifo_grounding.transforms.base import rows_of
 from ifo_grounding.transforms.reward import RewardTransform, last_part, numbers
 
 
@@ -22,9 +23,9 @@ class GoalReward(RewardTransform):
     An extension of the paper. The goal classifier sees the first image of the episode, the image
     after the step, and the instruction; it assumes that demonstrations end in success. Steps before
     the stop are paid nothing, and so are episodes that are cut. The transform carries the first
-    image as ``initial_pixels``. The true reward stays where it is; the classifier moves with the
-    environment's device and keeps its mode (train or eval). Called on a tensordict, or appended to
-    a replay buffer, the transform relabels steps that were collected before.
+    image as ``initial_pixels``. The true reward stays where it is, and the classifier in its mode
+    (train or eval). Called on a tensordict, or appended to a replay buffer, the transform relabels
+    steps that were collected before.
 
     Args:
         goal_classifier: TensorDictModule to a logit from ``pixels``, the image after the step, and
@@ -62,10 +63,9 @@ class GoalReward(RewardTransform):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__(goal_classifier, GOAL_SCORE, in_keys, out_keys, also=[ACTION])
-        if stop_action is not None:
-            stop_action = whole("stop_action", stop_action)
-            if stop_action < 0:
-                raise UserError(f"stop_action is an action, from 0 on, got {stop_action}")
+        stop_action = None if stop_action is None else whole("stop_action", stop_action)
+        if stop_action is not None and stop_action < 0:
+            raise UserError(f"stop_action is an action, from 0 on, got {stop_action}")
         if arrival is not None and not 0.0 < arrival <= 1.0:
             raise UserError(f"arrival is a probability above 0 and at most 1, got {arrival}")
         if arrival is not None and stop_action is not None:
@@ -83,28 +83,27 @@ class GoalReward(RewardTransform):
         carried = INITIAL_PIXELS in roles
         self.initial_pixels_key = self.in_keys[roles.index(INITIAL_PIXELS)] if carried else None
 
-    def pay(self, before: TensorDictBase, after: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return the reward, float32 [*B, 1], and the steps that are paid, bool [*B, 1]."""
-        paid = self._ends(before, after)
-        asked = paid.nonzero().squeeze(-1)
-        reward = torch.zeros(len(paid), dtype=torch.float32, device=paid.device)
+    def pay(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
+        """Return the reward, float32 [*B, 1], of steps [*B] and what they led to [*B]."""
+        ends = self._ends(before, after)
+        asked = ends.nonzero().squeeze(-1)
+        reward = torch.zeros(len(ends), dtype=torch.float32, device=ends.device)
         reward[asked] = self._score([
-            self._rows(after if key == self.pixels_key else before, key)[asked]
+            rows_of(after if key == self.pixels_key else before, key)[asked]
             for key in self.in_keys[:-1]
         ]).sigmoid()  # fmt: skip
         if self.arrival is not None:
-            paid = reward >= self.arrival
-            reward = reward.where(paid, 0.0)
-        return reward.view(*before.batch_size, 1), paid.view(*before.batch_size, 1)
+            reward = reward.where(reward >= self.arrival, 0.0)
+        return reward.view(*before.batch_size, 1)
 
     def _ends(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
         """Steps after which the classifier is asked, bool [R]."""
         if self.arrival is not None:
-            pixels = self._rows(after, self.pixels_key)
+            pixels = rows_of(after, self.pixels_key)
             return torch.ones(len(pixels), dtype=torch.bool, device=pixels.device)
         if self.stop_action is None:
-            return self._rows(after, "terminated").flatten().bool()
-        return numbers(self._rows(before, self.in_keys[-1])).flatten() == self.stop_action
+            return rows_of(after, "terminated").flatten().bool()
+        return numbers(rows_of(before, self.in_keys[-1])).flatten() == self.stop_action
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -116,24 +115,19 @@ class GoalReward(RewardTransform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._check_place()
         if (key := self.initial_pixels_key) is not None:
             next_tensordict.set(key, tensordict.get(key))
-        reward, reached = self.pay(tensordict, next_tensordict)
+        super()._step(tensordict, next_tensordict)
         if self.arrival is not None:
+            reached = next_tensordict.get(self.out_keys[0]) > 0
             for flag_key in self.parent.done_keys:
                 if last_part(flag_key) != "truncated":
                     flag = next_tensordict.get(flag_key)
                     next_tensordict.set(flag_key, flag | reached.view_as(flag))
-        return next_tensordict.set(self.out_keys[0], reward)
+        return next_tensordict
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Declare the learned reward beside the true one.
-
-        Raises:
-            UserError: where the environment pays a reward of that name already, or has no such
-                stop.
-        """
+        """Declare the learned reward beside the true one."""
         if self.stop_action is not None and self.parent is not None:
             count = getattr(self.parent.full_action_spec.get(self.in_keys[-1], None), "n", None)
             if isinstance(count, int) and self.stop_action >= count:

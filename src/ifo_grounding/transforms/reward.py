@@ -14,18 +14,14 @@ from torchrl.data import Composite, Unbounded
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import ACTION, ACTION_SCORE, LEARNED_REWARD, NEXT
 from ifo_grounding.modules import device_of, evaluating, output_key
-from ifo_grounding.transforms.base import EpisodeTransform, flat_logit, parts_of
+from ifo_grounding.transforms.base import EpisodeTransform, flat_logit, parts_of, rows_of
 
 ROWS_AT_ONCE = 4096
 """Rows that a model scores together, to bound memory."""
 
 
 class RewardTransform(EpisodeTransform):
-    """A transform that writes a reward from a learned model; the true reward stays where it is.
-
-    Subclasses say in :meth:`pay` what a step is worth. On an environment the reward is written
-    after every step. Called on a tensordict, or appended to a replay buffer, the transform relabels
-    steps that were collected before.
+    """A transform that writes what :meth:`pay` says a step is worth, by a learned model.
 
     Args:
         model: TensorDictModule that writes a logit.
@@ -59,61 +55,35 @@ class RewardTransform(EpisodeTransform):
         self.model = model
         self._names = names
 
-    def pay(self, before: TensorDictBase, after: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return what steps are worth.
-
-        Args:
-            before: the steps [*B]: states, instructions, actions.
-            after: what they led to [*B].
-
-        Returns:
-            The reward, float32 [*B, 1], and the steps that are paid for a goal, bool [*B, 1].
-        """
+    def pay(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
+        """Return the reward, float32 [*B, 1], of steps [*B] and what they led to [*B]."""
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the reward of collected steps [*B] below ``next``.
-
-        Raises:
-            UserError: where an entry is missing that the model reads.
-        """
+        """Write the reward of collected steps [*B] below ``next``."""
         after = tensordict.get(NEXT, tensordict.empty())
-        after.set(self.out_keys[0], self.pay(tensordict, after)[0])
+        after.set(self.out_keys[0], self.pay(tensordict, after))
         return tensordict.set(NEXT, after)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._check_place()
-        reward, _ = self.pay(tensordict, next_tensordict)
-        return next_tensordict.set(self.out_keys[0], reward)
+        return next_tensordict.set(self.out_keys[0], self.pay(tensordict, next_tensordict))
 
     def _check_place(self) -> None:
         """Refuse a later transform that changes what the model reads.
 
         A step is given what later transforms made of the last observation.
         """
-        beside = getattr(self.container, "transform", None)
-        parts = [] if beside is None else parts_of(beside)
-        later = parts[parts.index(self) + 1 :] if self in parts else []
+        parts = parts_of(self.container.transform)
+        later = parts[parts.index(self) + 1 :]
         written = {unravel_key(key) for part in later for key in part.out_keys or []}
-        if not written.isdisjoint(self.in_keys):
-            shown = self.parent.full_observation_spec.keys(True, True)
-            if changed := written & set(self.in_keys) & set(shown):
-                raise UserError(
-                    f"a transform after {type(self).__name__} changes {sorted(map(str, changed))}, "
-                    "which its model reads: put it before, or let it write to other out_keys"
-                )
-
-    def _rows(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        """Entry of a tensordict [*B], its batch made one dimension."""
-        value = tensordict.get(key, None)
-        if value is None:
+        if changed := written & set(self.in_keys):
+            changed &= set(self.parent.full_observation_spec.keys(True, True))
+        if changed:
             raise UserError(
-                f"{type(self).__name__} needs the entry {key!r}: the tensordict has "
-                f"{sorted(map(str, tensordict.keys(True, True)))}; collect with the transform on "
-                "the environment, or name other in_keys"
+                f"a transform after {type(self).__name__} changes {sorted(map(str, changed))}, "
+                "which its model reads: put it before, or let it write to other out_keys"
             )
-        batch = tensordict.batch_size
-        return value.reshape(batch.numel(), *value.shape[len(batch) :])
 
     def _score(self, entries: Sequence[Tensor]) -> Tensor:
         """Logits [R] for what the model reads, on the device of these entries."""
@@ -132,11 +102,7 @@ class RewardTransform(EpisodeTransform):
         return torch.cat(parts).to(home)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Declare the learned reward beside the true one.
-
-        Raises:
-            UserError: where the environment pays a reward of that name already.
-        """
+        """Declare the learned reward beside the true one."""
         if (key := self.out_keys[0]) in reward_spec.keys(True, True):
             raise UserError(
                 f"the environment pays {key!r} already, which stays where it is: give other "
@@ -161,9 +127,8 @@ class LearnedReward(RewardTransform):
 
     The reward is ``rwd(s, t, a)``, the sigmoid of the reward model's logit for the state, the
     instruction and the action, written under ``("next", "learned_reward")``. The true reward stays
-    where it is. The model moves with the environment's device; its mode (train or eval) is left as
-    it is. Called on a tensordict, or appended to a replay buffer, the transform relabels steps that
-    were collected before.
+    where it is, and the model in its mode (train or eval). Called on a tensordict, or appended to a
+    replay buffer, the transform relabels steps that were collected before.
 
     Args:
         reward_model: TensorDictModule from (pixels, instruction, action) to a logit.
@@ -191,14 +156,13 @@ class LearnedReward(RewardTransform):
     ) -> None:
         super().__init__(reward_model, ACTION_SCORE, in_keys, out_keys)
 
-    def pay(self, before: TensorDictBase, after: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return the probabilities of actions, float32 [*B, 1], and zeros, bool [*B, 1]."""
-        entries = [self._rows(before, key) for key in self.in_keys]
+    def pay(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
+        """Return the probabilities of actions, float32 [*B, 1]."""
+        entries = [rows_of(before, key) for key in self.in_keys]
         for place, name in enumerate(self._names):
             if last_part(name) == ACTION:
                 entries[place] = numbers(entries[place])
-        reward = self._score(entries).sigmoid().view(*before.batch_size, 1)
-        return reward, torch.zeros_like(reward, dtype=torch.bool)
+        return self._score(entries).sigmoid().view(*before.batch_size, 1)
 
 
 def last_part(key: NestedKey) -> str:

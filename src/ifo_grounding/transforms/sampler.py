@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -11,15 +12,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one
-from ifo_grounding.keys import INSTRUCTION, PIXELS
 from ifo_grounding.seeding import generator
-from ifo_grounding.transforms.base import InstructionTransform
-from ifo_grounding.transforms.choosing import (
-    PoolScorer,
-    check_options,
-    check_pool,
-    choose_instructions,
-)
+from ifo_grounding.transforms.base import InstructionTransform, check_pool, rows_of
+from ifo_grounding.transforms.choosing import Choices, PoolScorer, check_options
 
 
 class NothingSuitableError(UserError, RuntimeError):
@@ -31,12 +26,11 @@ class InstructionSampler(InstructionTransform):
 
     At each reset, full or partial, some instructions of the pool are scored for each new state and
     one above the threshold is kept for the episode. Where there is none, the simulator draws a new
-    state for that row (paper, "Instruction Module"). The instruction is written at the reset,
-    carried along by every step, and declared in the specs.
+    state for that row (paper, "Instruction Module"). Every step carries the instruction along.
 
-    The classifier moves with the environment's device. Its mode (train or eval) is left as it is.
-    Instructions come from the transform's own generator, so ``env.set_seed`` leaves them alone; in
-    workers of a batched environment, give each worker's transform a seed of its own.
+    The classifier's mode (train or eval) is left as it is. Instructions come from the transform's
+    own generator, so ``env.set_seed`` leaves them alone; in workers of a batched environment, give
+    each worker's transform a seed of its own.
 
     Args:
         classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
@@ -82,24 +76,15 @@ class InstructionSampler(InstructionTransform):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(in_keys=in_keys or [PIXELS], out_keys=out_keys or [INSTRUCTION])
-        check_options(threshold, candidates, choose)
-        max_tries = at_least_one("max_tries", max_tries)
-        self.threshold, self.candidates, self.choose = threshold, candidates, choose
-        self.max_tries = max_tries
-        distinct = check_pool(pool).unique(dim=0)
-        self.scorer = PoolScorer(classifier, distinct, self.in_keys[0])
+        super().__init__(check_pool(pool).unique(dim=0), in_keys, out_keys)
+        self.options: dict[str, Any] = {"threshold": threshold, "candidates": candidates}
+        self.options["choose"] = choose
+        check_options(**self.options)
+        self.max_tries = at_least_one("max_tries", max_tries)
+        self.scorer = PoolScorer(classifier, self.tokens, self.in_keys[0])
         self.classifier = classifier
-        self.register_buffer("pool", distinct, persistent=False)
         self.set_seed(seed)
         self._clear_stats()
-
-    pool: Tensor
-
-    @property
-    def tokens(self) -> Tensor:
-        """The pool, int64 [N, L]."""
-        return self.pool
 
     def set_seed(self, seed: int) -> None:
         """Restart the choices from a seed."""
@@ -116,10 +101,8 @@ class InstructionSampler(InstructionTransform):
     def stats(self) -> dict[str, float]:
         """Return what happened since the last call, and start counting anew.
 
-        Returns:
-            ``states_drawn`` and ``states_served`` (those that got an instruction), their ratio
-            ``served_share``, ``candidates_scored``, and ``mean_score``, the mean probability of
-            the chosen pairs.
+        ``states_served`` are those that got an instruction, ``served_share`` their share of
+        ``states_drawn``; ``mean_score`` is the mean probability of the chosen pairs.
         """
         stats = {
             "states_drawn": float(self._drawn),
@@ -135,21 +118,14 @@ class InstructionSampler(InstructionTransform):
         self._drawn = self._served = self.scorer.scored = 0
         self._score_sum = 0.0
 
-    def _choose(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def _choose(self, pixels: Tensor) -> Choices:
         self.scorer.classifier = self.classifier  # another one may have been put there
-        index, score = choose_instructions(
-            self.scorer,
-            None,
-            pixels,
-            threshold=self.threshold,
-            candidates=self.candidates,
-            choose=self.choose,
-            generator=self.generator,
-        )
-        self._drawn += len(index)
-        self._served += int((index >= 0).sum())
-        self._score_sum += float(score[index >= 0].sum())
-        return index, score
+        choices = self.scorer.choose(pixels, generator=self.generator, **self.options)
+        found = choices.chosen >= 0
+        self._drawn += len(found)
+        self._served += int(found.sum())
+        self._score_sum += float(choices.score[found].sum())
+        return choices
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -157,32 +133,27 @@ class InstructionSampler(InstructionTransform):
         batch = tensordict_reset.batch_size
         rows = batch.numel()
         waiting = self.new_rows(tensordict, rows)
-        pixels = tensordict_reset.get(self.in_keys[0])
-        instruction = self.pool.new_zeros(rows, self.pool.shape[1], device=pixels.device)
+        home = tensordict_reset.get(self.in_keys[0]).device
+        instruction = self.tokens.new_zeros(rows, self.tokens.shape[1], device=home)
         best_score, attempt = 0.0, 0
         while len(waiting) and attempt < self.max_tries:
             if attempt:
                 tensordict_reset = self._draw_again(tensordict_reset, waiting)
-            pixels = tensordict_reset.get(self.in_keys[0])
-            waiting = waiting.to(pixels.device)
-            index, score = self._choose(pixels.reshape(rows, *pixels.shape[len(batch) :])[waiting])
+            waiting = waiting.to(home)
+            index, score = self._choose(rows_of(tensordict_reset, self.in_keys[0])[waiting])
             found = index >= 0
-            instruction[waiting[found]] = self.pool.to(pixels.device)[index[found]]
+            instruction[waiting[found]] = self.tokens.to(home)[index[found]]
             waiting = waiting[~found]
             attempt += 1
             best_score = max(best_score, float(score.max()))
         if len(waiting):
-            raise NothingSuitableError(self._complaint(len(waiting), attempt, best_score))
-        tensordict_reset.set(self.out_keys[0], instruction.reshape(*batch, -1))
-        return tensordict_reset
-
-    def _complaint(self, waiting: int, tries: int, best_score: float) -> str:
-        return (
-            f"no instruction of the pool scored above {self.threshold} on any of "
-            f"{tries} states in {waiting} of the rows (best score seen in this reset: "
-            f"{best_score:.2f}; {self._served} of {self._drawn} states served so far): lower "
-            "threshold, raise candidates or max_tries, or train the classifier longer"
-        )
+            raise NothingSuitableError(
+                f"no instruction of the pool scored above {self.options['threshold']} on any of "
+                f"{attempt} states in {len(waiting)} of the rows (best score seen in this reset: "
+                f"{best_score:.2f}; {self._served} of {self._drawn} states served so far): lower "
+                "threshold, raise candidates or max_tries, or train the classifier longer"
+            )
+        return tensordict_reset.set(self.out_keys[0], instruction.reshape(*batch, -1))
 
     def _draw_again(self, tensordict_reset: TensorDictBase, rows: Tensor) -> TensorDictBase:
         """Let the simulator draw new states for some rows and leave the others as they are."""
@@ -200,20 +171,13 @@ class InstructionSampler(InstructionTransform):
         return parent.reset(request, select_reset_only=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write a suitable instruction for every state of a tensordict [*B].
-
-        Raises:
-            NothingSuitableError: where a state has none, as no simulator can draw another.
-        """
-        pixels = tensordict.get(self.in_keys[0])
-        batch = tensordict.batch_size
-        index, score = self._choose(pixels.reshape(batch.numel(), *pixels.shape[len(batch) :]))
+        """Write a suitable instruction for every state of a tensordict [*B], or raise."""
+        index, score = self._choose(rows_of(tensordict, self.in_keys[0]))
         if (index < 0).any():
             raise NothingSuitableError(
                 f"{int((index < 0).sum())} of {len(index)} states have no instruction above "
-                f"{self.threshold} (best score {float(score[index < 0].max()):.2f}): select states "
-                "with choose_instructions first, or lower threshold"
+                f"{self.options['threshold']} (best score {float(score[index < 0].max()):.2f}): "
+                "select states with PoolScorer.choose first, or lower threshold"
             )
-        chosen = self.pool.to(pixels.device)[index]
-        tensordict.set(self.out_keys[0], chosen.reshape(*batch, chosen.shape[-1]))
-        return tensordict
+        chosen = self.tokens.to(index.device)[index]
+        return tensordict.set(self.out_keys[0], chosen.reshape(*tensordict.batch_size, -1))

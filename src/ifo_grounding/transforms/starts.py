@@ -13,11 +13,10 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.attributes import untransformed
 from ifo_grounding.errors import UserError
-from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
+from ifo_grounding.keys import INSTRUCTION, SCENE
 from ifo_grounding.mosaic import PIXELS_PER_WORD, as_words
 from ifo_grounding.seeding import generator
-from ifo_grounding.transforms.base import InstructionTransform
-from ifo_grounding.transforms.choosing import check_pool
+from ifo_grounding.transforms.base import InstructionTransform, rows_of
 
 FRAME_HASH = "frame_hash"
 """Key of :func:`frame_hash` in stored pairs, int64 [N, 1]."""
@@ -28,9 +27,7 @@ class StartingPairs(InstructionTransform):
 
     The paper's second phase explores from 5K or 10K chosen pairs (paper, "Experimental Settings");
     :func:`ifo_grounding.training.select_pairs` stores them. Each pair is used once, in random
-    order, before any is used again. The scene's number is handed to the simulator at the reset;
-    the instruction is written at the reset, carried along by every step, and declared in the
-    specs.
+    order, before any is used again. Every step carries the instruction along.
 
     Args:
         pairs: TensorDict [N] with ``scene`` int64 [N, 1] and ``instruction`` int64 [N, L]. With
@@ -63,31 +60,26 @@ class StartingPairs(InstructionTransform):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(in_keys=in_keys or [PIXELS], out_keys=out_keys or [INSTRUCTION])
-        pairs = check_pairs(pairs)
-        self.register_buffer("scenes", pairs[SCENE].reshape(-1), persistent=False)
-        self.register_buffer("instructions", pairs[INSTRUCTION], persistent=False)
-        hashes = pairs.get(FRAME_HASH, None)
-        hashes = None if hashes is None else hashes.reshape(-1)
-        self.register_buffer("hashes", hashes, persistent=False)
+        missing = [key for key in (SCENE, INSTRUCTION) if pairs.get(key, None) is None]
+        if missing:
+            raise UserError(f"pairs lack {missing}: they come from select_pairs or load_pairs")
+        super().__init__(pairs[INSTRUCTION], in_keys, out_keys)
+        scene, hashes = pairs[SCENE], pairs.get(FRAME_HASH, None)
+        if scene.is_floating_point() or scene.numel() != len(self.tokens):
+            raise UserError(f"scene must be int64 [N, 1], got {scene.dtype} {list(scene.shape)}")
+        self.register_buffer("scenes", scene.reshape(-1), persistent=False)
+        self.hashes = None if hashes is None else hashes.reshape(-1)
         self._begin(seed)
 
     fixes_scenes = True
     """The simulator's own seed decides nothing, since every scene is asked for by number."""
 
     scenes: Tensor
-    instructions: Tensor
-    hashes: Tensor | None
 
-    @property
-    def tokens(self) -> Tensor:
-        """The pairs' instructions, int64 [N, L]."""
-        return self.instructions
-
-    def _begin(self, seed: int) -> None:
-        self.seed, self.used = seed, 0
+    def _begin(self, seed: int, used: int = 0) -> None:
+        self.seed, self.used = seed, used
         self._epoch, self._order = -1, torch.empty(0, dtype=torch.int64)
-        self._current = torch.empty(0, dtype=torch.int64)
+        self._current = self._order
 
     def get_extra_state(self) -> Tensor:
         """Return the place in the order: ``state_dict`` resumes there."""
@@ -95,9 +87,7 @@ class StartingPairs(InstructionTransform):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Resume at a place in the order."""
-        seed, used = state.tolist()
-        self._begin(seed)
-        self.used = used
+        self._begin(*state.tolist())
 
     def _take(self, count: int) -> Tensor:
         """Take the next pairs, int64 [count]."""
@@ -130,25 +120,18 @@ class StartingPairs(InstructionTransform):
     ) -> TensorDictBase:
         batch = tensordict_reset.batch_size
         if self.hashes is not None:
-            self._check_frames(tensordict, tensordict_reset)
-        instruction = self.instructions[self._current].reshape(*batch, -1)
-        tensordict_reset.set(self.out_keys[0], instruction)
-        return tensordict_reset
-
-    def _check_frames(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> None:
-        assert self.hashes is not None
-        batch = tensordict_reset.batch_size
-        pixels = tensordict_reset.get(self.in_keys[0])
-        pixels = pixels.reshape(batch.numel(), *pixels.shape[len(batch) :])
-        rows = self.new_rows(tensordict, batch.numel()).to(pixels.device)
-        expected = self.hashes[self._current].to(pixels.device)[rows]
-        if (wrong := frame_hash(pixels[rows]) != expected).any():
-            number = int(self.scenes[self._current].to(pixels.device)[rows][wrong][0])
-            raise UserError(
-                f"scene {number} is not the one that its pair was stored with: make the "
-                "environment with the task, seed, stream, layout and tile size that select_pairs "
-                "was given"
-            )
+            pixels = rows_of(tensordict_reset, self.in_keys[0])
+            rows = self.new_rows(tensordict, len(pixels)).to(pixels.device)
+            pairs = self._current.to(pixels.device)[rows]
+            wrong = frame_hash(pixels[rows]) != self.hashes.to(pixels.device)[pairs]
+            if wrong.any():
+                raise UserError(
+                    f"scene {int(self.scenes[pairs[wrong][0]])} is not the one that its pair was "
+                    "stored with: make the environment with the task, seed, stream, layout and "
+                    "tile size that select_pairs was given"
+                )
+        instruction = self.tokens[self._current].reshape(*batch, -1)
+        return tensordict_reset.set(self.out_keys[0], instruction)
 
     def check_env(self, env: EnvBase) -> None:
         """Raise :class:`UserError` where an environment does not suit."""
@@ -164,22 +147,6 @@ class StartingPairs(InstructionTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return stored data as it is: pairs are drawn where an environment resets."""
         return tensordict
-
-
-def check_pairs(pairs: TensorDictBase) -> TensorDictBase:
-    """Return ``pairs`` if they are a TensorDict [N] of scenes and instructions.
-
-    Raises:
-        UserError: where they are not.
-    """
-    missing = [key for key in (SCENE, INSTRUCTION) if pairs.get(key, None) is None]
-    if missing:
-        raise UserError(f"pairs lack {missing}: they come from select_pairs or load_pairs")
-    check_pool(pairs[INSTRUCTION])
-    scene = pairs[SCENE]
-    if scene.is_floating_point() or scene.numel() != len(pairs[INSTRUCTION]):
-        raise UserError(f"scene must be int64 [N, 1], got {scene.dtype} {list(scene.shape)}")
-    return pairs
 
 
 def frame_hash(pixels: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from typing import Any
 
 from omegaconf import MISSING
 from torch import Tensor
@@ -30,38 +31,21 @@ class BabyAI(World):
         babyai(self.level, self.tile_size)  # refuses what is no level
         self.actions, self.stop_action = BABYAI_ACTIONS, DONE
 
-    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> GymnasiumEnv:
+    def simulator(self, num_envs: int, **options: Any) -> GymnasiumEnv:
         """Return rooms without missions; see :class:`World`."""
-        return self._rooms(num_envs, seed, "training", "none", device)
+        return self._rooms("none", num_envs, **options)
 
     def instructed(
-        self,
-        num_envs: int,
-        *,
-        seed: int,
-        stream: str,
-        split: str = "all",
-        waits: bool = False,
-        device: str = "cpu",
+        self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
     ) -> GymnasiumEnv:
         """Return rooms with their missions, which end with them unless they are to wait."""
         check_choice("evaluate.split of BabyAI", split, ["all"])
-        return self._rooms(num_envs, seed, stream, "waits" if waits else "ends", device)
+        return self._rooms("waits" if waits else "ends", num_envs, **options)
 
-    def demonstrate(
-        self, n: int, *, seed: int, stream: str = "training", progress: bool = False
-    ) -> tuple[Demonstrations, Truth | None]:
+    def demonstrate(self, n: int, **options: Any) -> tuple[Demonstrations, Truth | None]:
         """Let the bot demonstrate, and keep its actions apart."""
-        return record_babyai(
-            self.level,
-            n,
-            keep_truth=True,
-            seed=seed,
-            stream=stream,
-            tile_size=self.tile_size,
-            processes=self._processes,
-            progress=progress,
-        )
+        options = {"tile_size": self.tile_size, "processes": self._processes, **options}
+        return record_babyai(self.level, n, keep_truth=True, **options)
 
     def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
         """Return the bot's own success."""
@@ -73,9 +57,7 @@ class BabyAI(World):
     def _processes(self) -> int:
         return self.processes or os.cpu_count() or 1
 
-    def _rooms(
-        self, num_envs: int, seed: int, stream: str, mission: str, device: str
-    ) -> GymnasiumEnv:
+    def _rooms(self, mission: str, num_envs: int, **options: Any) -> GymnasiumEnv:
         if self.vocabulary is None:
             raise UserError("record demonstrations first: they hold the words of the missions")
         return from_gymnasium(
@@ -85,7 +67,5 @@ class BabyAI(World):
             instructed=mission != "none",
             stop=self.stop_action,
             skip_unknown=True,  # no demonstration taught them
-            seed=seed,
-            stream=stream,
-            device=device,
+            **options,
         )

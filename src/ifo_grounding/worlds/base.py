@@ -53,15 +53,9 @@ class World(ABC):
 
     @abstractmethod
     def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> EnvBase:
-        """Return all that a learner may step: worlds without instructions and true rewards.
+        """Return all that a learner may step: training scenes without instructions and rewards.
 
-        Args:
-            num_envs: worlds side by side.
-            seed: of the stream of training scenes.
-            device: where they live.
-
-        Returns:
-            An environment of batch size [num_envs] that shows ``pixels``, uint8 [*B, C, H, W].
+        The environment has the batch size [num_envs] and shows ``pixels``, uint8 [*B, C, H, W].
         """
 
     @abstractmethod
@@ -84,7 +78,7 @@ class World(ABC):
             split: which instructions, where a world knows several splits.
             waits: whether an episode whose instruction is fulfilled goes on until the policy stops,
                 so that a learned reward at the stop can be compared with success.
-            device: where they live.
+            device: where tensors go.
         """
 
     def demonstrate(

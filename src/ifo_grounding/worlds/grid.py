@@ -55,38 +55,26 @@ class Grid(World):
         grammar(self.task)
         self.layout = Layout(self.size, (*self.objects,), (*self.boxes,), self.inside)
         self.actions, self.stop_action, self.vocabulary = keys.ACTIONS, keys.STOP, VOCABULARY
-        self.oracle = GridOracle(self)
+        self.oracle = self
 
     def scenes(self, **chosen: Any) -> dict[str, Any]:
         """Return the arguments that environments, recorder and oracle share."""
         names = ("tile_size", "split", "holdout", "holdout_visible", "layout")
         return {**{name: getattr(self, name) for name in names}, **chosen}
 
-    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> PickAndPlaceEnv:
+    def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions and true rewards; see :class:`World`."""
-        options = self.scenes(seed=seed, device=device, instructed=False)
-        return PickAndPlaceEnv(self.task, num_envs, **options)
+        return PickAndPlaceEnv(self.task, num_envs, instructed=False, **self.scenes(**options))
 
     def instructed(
-        self,
-        num_envs: int,
-        *,
-        seed: int,
-        stream: str,
-        split: str = "all",
-        waits: bool = False,
-        device: str = "cpu",
+        self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
     ) -> PickAndPlaceEnv:
         """Return worlds with an instruction; a fulfilled one ends no episode."""
-        options = self.scenes(seed=seed, stream=stream, split=split, device=device)
-        return PickAndPlaceEnv(self.task, num_envs, **options)
+        return PickAndPlaceEnv(self.task, num_envs, **self.scenes(split=split, **options))
 
-    def demonstrate(
-        self, n: int, *, seed: int, stream: str = "training", progress: bool = False
-    ) -> tuple[Demonstrations, Truth | None]:
+    def demonstrate(self, n: int, **options: Any) -> tuple[Demonstrations, Truth | None]:
         """Record the expert."""
-        options = self.scenes(seed=seed, stream=stream, progress=progress)
-        return record_demonstrations(self.task, n, keep_truth=True, **options)
+        return record_demonstrations(self.task, n, keep_truth=True, **self.scenes(**options))
 
     def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
         """Return the expert's success: it never fails."""
@@ -101,24 +89,17 @@ class Grid(World):
             raise UserError(f"{folder} is of another task: {error}; say task=...") from None
         return demos
 
-
-class GridOracle:
-    """Knows the truth of a :class:`Grid`."""
-
-    def __init__(self, world: Grid) -> None:
-        self.world = world
-
     def suitable_rate(self, classifier: Any, pool: Tensor, **options: Any) -> SuitabilityResult:
         """Check the instructions that a classifier chooses for fresh states."""
-        return suitable_rate(classifier, self.world.task, pool, **self.world.scenes(**options))
+        return suitable_rate(classifier, self.task, pool, **self.scenes(**options))
 
     def endings(self, policy: nn.Module, episodes: int, **scenes: Any) -> Endings:
         """Say how the policy's episodes end."""
-        options = self.world.scenes(episodes=episodes, **scenes)
-        return episode_endings(policy, self.world.task, **options)
+        options = self.scenes(episodes=episodes, **scenes)
+        return episode_endings(policy, self.task, **options)
 
     def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
         """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
         from ifo_grounding.report import instruction_cases  # draws: slow to import
 
-        return instruction_cases(classifier, self.world.task, pool, **self.world.scenes(**options))
+        return instruction_cases(classifier, self.task, pool, **self.scenes(**options))

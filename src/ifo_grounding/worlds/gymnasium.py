@@ -47,27 +47,20 @@ class Gymnasium(World):
         if isinstance(self.stop, str) and self.stop != "add":
             raise UserError(f"world.stop is a number of an action, add or null, got {self.stop!r}")
         world = self._maker()()
-        count = getattr(world.action_space, "n", 0) + (self.stop == "add")
+        count = int(getattr(world.action_space, "n", 0)) + (self.stop == "add")
         world.close()
-        self.actions = self.names or action_names(int(count))
-        self.stop_action = int(count) - 1 if isinstance(self.stop, str) else self.stop
+        self.actions = self.names or action_names(count)
+        self.stop_action = count - 1 if isinstance(self.stop, str) else self.stop
 
-    def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> GymnasiumEnv:
+    def simulator(self, num_envs: int, **options: Any) -> GymnasiumEnv:
         """Return worlds without instructions and rewards; see :class:`World`."""
-        return self._worlds(num_envs, seed, "training", device, instructed=False)
+        return self._worlds(num_envs, instructed=False, **options)
 
     def instructed(
-        self,
-        num_envs: int,
-        *,
-        seed: int,
-        stream: str,
-        split: str = "all",
-        waits: bool = False,
-        device: str = "cpu",
+        self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
     ) -> GymnasiumEnv:
         """Return worlds with their instructions, which end as they end."""
-        return self._worlds(num_envs, seed, stream, device, instructed=True)
+        return self._worlds(num_envs, instructed=True, **options)
 
     def _maker(self) -> Callable[[], gymnasium.Env]:
         if self.factory is None:
@@ -78,9 +71,7 @@ class Gymnasium(World):
             raise UserError(f"world.factory={self.factory} cannot be imported: {error}") from None
         return lambda: factory(**self.make)
 
-    def _worlds(
-        self, num_envs: int, seed: int, stream: str, device: str, instructed: bool
-    ) -> GymnasiumEnv:
+    def _worlds(self, num_envs: int, **options: Any) -> GymnasiumEnv:
         if self.vocabulary is None:
             raise UserError("read demonstrations first: they hold the words of instructions")
         return from_gymnasium(
@@ -89,10 +80,7 @@ class Gymnasium(World):
             num_envs=num_envs,
             image=self.image,
             instruction=self.instruction,
-            instructed=instructed,
             stop=self.stop,
             skip_unknown=self.skip_unknown,
-            seed=seed,
-            stream=stream,
-            device=device,
+            **options,
         )

@@ -1,0 +1,83 @@
+"""What environments of worlds with numbered scenes have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.errors import UserError, at_least_one
+from ifo_grounding.tasks.vocabulary import Vocabulary
+
+DONE = ("done", "terminated", "truncated")
+
+
+class NumberedEnv(EnvBase):
+    """Worlds side by side whose scenes have numbers, with an image and an instruction.
+
+    Args:
+        num_envs: worlds side by side.
+        vocabulary: the words of the instructions.
+        instructed: whether instructions are shown.
+        device: where tensors go.
+    """
+
+    steps_on = True
+    """A row may be stepped after its end: it goes on, or stays as it is."""
+
+    def __init__(
+        self,
+        num_envs: int,
+        vocabulary: Vocabulary,
+        instructed: bool,
+        device: torch.device | str | None,
+    ) -> None:
+        num_envs = at_least_one("num_envs", num_envs)
+        super().__init__(device=device or "cpu", batch_size=[num_envs])
+        self.num_envs = num_envs
+        self.vocabulary, self.instructed = vocabulary, instructed
+        self.vocabulary_size, self.instruction_length = len(vocabulary), vocabulary.length
+
+    def _bounded(self, high: int, *shape: int, dtype: torch.dtype = torch.int64) -> Bounded:
+        shape = (*self.batch_size, *shape)
+        return Bounded(0, high, shape=shape, dtype=dtype, device=self.device)
+
+    def _declare(self, image_shape: Sequence[int], n_actions: int, **more: Composite) -> None:
+        on: Any = {"shape": self.batch_size, "device": self.device}
+        observation = Composite(more, **on)
+        observation[keys.PIXELS] = self._bounded(255, *image_shape, dtype=torch.uint8)
+        if self.instructed:
+            words = self._bounded(self.vocabulary_size - 1, self.instruction_length)
+            observation[keys.INSTRUCTION] = words
+        self.observation_spec = observation
+        self.action_spec = Categorical(n_actions, **on)
+        flag: Any = {"shape": (*self.batch_size, 1), "device": self.device}
+        self.reward_spec = Unbounded(dtype=torch.float32, **flag)
+        flags = {name: Binary(1, dtype=torch.bool, **flag) for name in DONE}
+        self.done_spec = Composite(flags, **on)
+
+    def _asked(
+        self, tensordict: TensorDictBase | None, started: bool
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return the rows that begin an episode, int64 [R], and the scenes asked for there."""
+        given: Any = {} if tensordict is None else tensordict
+        mask = given.get("_reset", None)
+        if mask is None or not started:
+            rows = torch.arange(self.num_envs, device=self.device)
+        else:
+            rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
+        numbers = given.get(keys.SCENE, None)
+        if numbers is None:
+            return rows, None
+        if numbers.is_floating_point() or numbers.dtype == torch.bool:
+            raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
+        numbers = numbers.reshape(self.num_envs)[rows].long()
+        if len(numbers) and int(numbers.min()) < 0:
+            raise UserError("scene numbers start at 0")
+        return rows, numbers
