@@ -11,7 +11,7 @@ from ifo_grounding.evaluation import episode_endings
 from ifo_grounding.modules import take_word_penalty
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy, make_value
 from ifo_grounding.networks.grounding import BEARINGS, MODIFIER, swap_words
-from ifo_grounding.networks.warm_start import instructed_network
+from ifo_grounding.networks.trunk import instructed_network
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
 from ifo_grounding.training import FitConfig, fit
@@ -168,7 +168,7 @@ def what_is_seen(trunk, image, words="red circle"):
         trunk.attention.bias.zero_()
         both = trunk(image, VOCABULARY.encode([words]))[0]
     maps, heads = 2 * trunk.words.relevance.out_channels, trunk.attention.out_features
-    turned = BEARINGS * 2 * (heads + maps) if trunk.bearing is not None else 0
+    turned = BEARINGS * 2 * (heads + maps) if trunk.around is not None else 0
     each = (len(both) - turned - 2 * maps - MODIFIER) // heads
     return both[2 : each - maps]
 

@@ -28,8 +28,6 @@ class ImitationLoss(SupervisedLoss):
     Of a network with :class:`~ifo_grounding.networks.WordMaps`, which reads word by word, it also
     writes ``loss_words``, which regularises what words say about colours and about form; its weight
     grows with the likelihood of the actions. A word that needs but one of the two then keeps to it.
-    Train such a network eagerly: inside ``torch.compile`` it does not tell words apart that occur
-    from those that do not, and there is no penalty.
 
     Args:
         network: a policy with ``get_dist``, such as ``make_policy`` or TorchRL's
