@@ -1,6 +1,5 @@
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from ifo_grounding.errors import UserError
@@ -98,12 +97,4 @@ def test_patches_of_a_ragged_image_are_padded_with_black():
 def test_whole_numbers_that_are_no_bytes_are_no_images(dtype):
     policy = make_policy(Shapes((3, 48, 48), vocabulary_size=9), "paper", seed=0)
     with pytest.raises(UserError, match=r"bytes \(uint8\) or floats within 0..1"):
-        policy(
-            TensorDict(
-                {
-                    "pixels": torch.zeros(2, 3, 48, 48, dtype=dtype),
-                    "instruction": torch.ones(2, 16, dtype=torch.int64),
-                },
-                [2],
-            )
-        )
+        policy(pixels=torch.zeros(2, 3, 48, 48, dtype=dtype), instruction=torch.ones(2, 16))
