@@ -58,10 +58,7 @@ def is_plain(image: Tensor) -> bool:
 def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
     """Return pixels in the precision of the weights that read them.
 
-    Bytes are scaled to [0, 1]; floating-point pixels are taken as scaled already.
-
-    Raises:
-        UserError: for other whole numbers, which may be scaled or not.
+    Bytes are scaled to [0, 1], floats are taken as scaled already, and other numbers are refused.
     """
     if pixels.dtype == torch.uint8:
         return pixels.to(weight.dtype).mul_(1 / 255)

@@ -69,6 +69,14 @@ class PairScorer(ImageNetwork):
         finally:
             self.expects = before
 
+    def _expected(self, scores: Tensor) -> Tensor:
+        """Return logits in the light of what :meth:`expect` said."""
+        scores = scores.float()
+        if not self.expects:
+            return scores
+        scores = scores + self.prior
+        return scores - self.mixed * torch.log1p(-scores.clamp(max=math.log(SUREST)).exp())
+
     def encode_scenes(self, *pixels: Tensor) -> Any:
         """Encode images, each [*B, C, H, W], for :meth:`score_candidates`."""
         raise NotImplementedError
@@ -91,11 +99,7 @@ class PairScorer(ImageNetwork):
         with self.autocast(words):
             some = [slice(begin, begin + rows) for begin in range(0, max(len(index), 1), rows)]
             read = [self.head(self._read(scenes[part], words, index[part])) for part in some]
-        scores = torch.cat(read).squeeze(-1).float()
-        if not self.expects:
-            return scores
-        scores = scores + self.prior
-        return scores - self.mixed * torch.log1p(-scores.clamp(max=math.log(SUREST)).exp())
+        return self._expected(torch.cat(read).squeeze(-1))
 
     def _read(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor:
         """Read N scenes in the light of some instructions [N, K]: [N, K, size]."""

@@ -89,7 +89,7 @@ def instructed_network(policy: nn.Module) -> InstructedNetwork:
 
 
 def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Tensor:
-    """Return how each map of a policy weighs the cells of images, in the light of instructions.
+    """Return how each map of a policy weighs the cells of images: float32 [N, M, h, w], sums are 1.
 
     The maps are the word maps of the preset ``strong``, each read as evidence for places and as
     evidence against them, and of ``paper`` what all gates together let through.
@@ -98,9 +98,6 @@ def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Te
         policy: built by ``make_policy``.
         pixels: uint8 [N, C, H, W].
         instruction: token ids, int64 [N, L].
-
-    Returns:
-        Weights, float32 [N, M, h, w], which sum to 1 over the cells of a map.
 
     >>> import torch
     >>> from ifo_grounding.networks import Shapes, make_policy
