@@ -53,9 +53,7 @@ def device_of(module: object) -> torch.device | None:
 
 
 def output_key(module: TensorDictModuleBase, *expected: str) -> NestedKey:
-    """Key under which a TensorDictModule writes what is asked of it.
-
-    It is the one that is named as expected, wherever it is nested, or the only one.
+    """Key of what a TensorDictModule is expected to write, wherever nested, or of all it writes.
 
     Raises:
         UserError: where ``module`` is no TensorDictModule, it is unclear which output is meant, or
@@ -98,11 +96,7 @@ def beside(batch: TensorDictBase, module: object) -> TensorDictBase:
 
 
 def has_word_penalty(module: nn.Module) -> bool:
-    """Whether a part of a module leaves a ``word_penalty`` when it computes in train mode.
-
-    >>> has_word_penalty(nn.Linear(1, 1))
-    False
-    """
+    """Whether a part of a module leaves a ``word_penalty`` when it computes in train mode."""
     return any(hasattr(part, "word_penalty") for part in module.modules())
 
 
@@ -135,13 +129,3 @@ def set_word_swapping(module: nn.Module, on: bool) -> None:
     for part in module.modules():
         if hasattr(part, "swaps_words"):
             part.swaps_words = on  # type: ignore[assignment]
-
-
-def hidden_from_python(tensor: Tensor) -> bool:
-    """Whether the compiler or a CUDA graph being captured works on ``tensor``.
-
-    No shape may then depend on its values.
-    """
-    if torch.compiler.is_compiling():
-        return True
-    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()

@@ -2,24 +2,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ifo_grounding.networks import (
-    Shapes,
-    make_goal_classifier,
-    make_instruction_classifier,
-    make_inverse,
-    make_policy,
-    make_reward_model,
-    make_value,
-)
+from ifo_grounding.networks import Shapes
+from ifo_grounding.networks.saving import MAKERS
 
-MAKERS = {
-    "inverse": make_inverse,
-    "policy": make_policy,
-    "value": make_value,
-    "instruction": make_instruction_classifier,
-    "reward": make_reward_model,
-    "goal": make_goal_classifier,
-}
 OUTPUTS = {
     "inverse": ("logits", "A"),
     "policy": ("logits", "A"),
@@ -64,3 +49,11 @@ def inputs(shapes: Shapes, batch: list[int], seed: int = 0) -> TensorDict:
         },
         batch,
     )
+
+
+def nested_keys(module) -> dict:
+    """Return names of all inputs and outputs under ``agent``, as options of the same maker."""
+    keys = {"in_keys": [("agent", *([k] if isinstance(k, str) else k)) for k in module.in_keys]}
+    if "action" in module.out_keys:
+        return {**keys, "action_key": ("agent", "choice"), "logits_key": ("agent", "scores")}
+    return {**keys, "out_key": ("agent", "said")}

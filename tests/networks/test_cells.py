@@ -8,14 +8,13 @@ from ifo_grounding.data import record_demonstrations
 from ifo_grounding.networks import (
     PatchEncoder,
     Shapes,
-    appearance,
     cells,
-    encoders,
     make_goal_classifier,
     make_instruction_classifier,
     make_inverse,
     make_policy,
     make_reward_model,
+    patches,
     word_scoring,
 )
 from ifo_grounding.networks.cells import distinct_pairs
@@ -42,6 +41,10 @@ def assert_same(found, expected):
         torch.testing.assert_close(gradient, expected[1][name], atol=1e-5, rtol=1e-4)
 
 
+def every_cell_for_itself(index, known):
+    return index, known.new_ones(index.shape), known
+
+
 @pytest.mark.parametrize("make", [make_policy, make_reward_model, make_inverse])
 def test_outputs_and_gradients_are_those_of_a_plain_pass(make, scenes, monkeypatch):
     pixels, tokens, shapes = scenes
@@ -51,10 +54,9 @@ def test_outputs_and_gradients_are_those_of_a_plain_pass(make, scenes, monkeypat
     network = network[0].module if make is make_policy else network
     inputs = (pixels, after) if make is make_inverse else (pixels, tokens)
     inputs += (torch.arange(24) % 6,) if make is make_reward_model else ()
-    assert encoders.distinct_patches(pixels, 8) is not None
+    assert len(patches.cells_of(pixels, 8)[0]) < 24 * 36 // 2
     found = outputs_and_gradients(network, *inputs)
-    for module in (encoders, appearance):
-        monkeypatch.setattr(module, "distinct_patches", lambda image, patch: None)
+    monkeypatch.setattr(patches, "is_plain", lambda image: False)
     assert_same(found, outputs_and_gradients(network, *inputs))
 
 
@@ -72,7 +74,7 @@ def test_scenes_are_read_by_kinds_of_cells_as_cell_by_cell(make, scenes, monkeyp
     network.forward = scored
     assert network.encode_scenes(*images).features.shape[-1] < 36
     found = outputs_and_gradients(network, *images)
-    monkeypatch.setattr(word_scoring, "hidden_from_python", lambda tensor: True)
+    monkeypatch.setattr(word_scoring, "group_cells", every_cell_for_itself)
     assert network.encode_scenes(*images).features.shape[-1] == 36
     assert_same(found, outputs_and_gradients(network, *images))
 
@@ -83,18 +85,18 @@ def test_patches_that_repeat_are_embedded_once(size, monkeypatch):
     image = torch.zeros(4, 3, *size, dtype=torch.uint8)
     image[:, :, 8:19, 10:30] = torch.arange(4, dtype=torch.uint8).view(4, 1, 1, 1) * 50
     rows = []
-    encoder.embed.register_forward_hook(lambda _, args, out: rows.append(out[..., 0].numel()))
+    encoder.embed.register_forward_hook(lambda _, args, out: rows.append(len(out)))
     quick = encoder(image)
-    monkeypatch.setattr(encoders, "distinct_patches", lambda image, patch: None)
+    monkeypatch.setattr(patches, "is_plain", lambda image: False)
     torch.testing.assert_close(quick, encoder(image))
     assert rows[0] < rows[1] // 2
 
 
 def test_where_looking_up_would_not_pay():
     noise = torch.randint(256, (4, 3, 48, 48), dtype=torch.uint8)
-    assert encoders.distinct_patches(noise, 8) is None  # no two patches are alike
-    assert encoders.distinct_patches(torch.zeros(4, 3, 48, 48), 8) is None  # floats
-    assert encoders.distinct_patches(torch.zeros_like(noise), 6) is None
+    for image, patch in ((noise, 8), (torch.zeros(4, 3, 48, 48), 8), (torch.zeros_like(noise), 6)):
+        cells, where = patches.cells_of(image, patch)
+        assert len(cells) == where.numel() == 4 * (48 // patch) ** 2
 
 
 @pytest.mark.parametrize("room", [1 << 22, 0])  # pairs are marked in a table, or sorted

@@ -11,7 +11,7 @@ from ifo_grounding.evaluation import episode_endings
 from ifo_grounding.modules import take_word_penalty
 from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy, make_value
 from ifo_grounding.networks.grounding import BEARINGS, MODIFIER, swap_words
-from ifo_grounding.networks.warm_start import instructed_network
+from ifo_grounding.networks.trunk import instructed_network
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
 from ifo_grounding.training import FitConfig, fit
@@ -25,6 +25,15 @@ def tiles(*objects, arm=35):
     for cell, name in enumerate(objects):
         state.objects[0, cell] = kind(*name.split())
     return render(state, 8)
+
+
+def batch(*sentences):
+    """Return one image with each of some instructions, and actions."""
+    count = len(sentences)
+    image = tiles("red circle", "blue triangle").expand(count, -1, -1, -1)
+    words = VOCABULARY.encode(list(sentences))
+    action = 5 - torch.arange(count)
+    return TensorDict({"pixels": image, "instruction": words, "action": action}, [count])
 
 
 def seen(image):
@@ -87,50 +96,32 @@ def test_words_are_swapped_between_instructions_of_a_length():
 
 
 def test_what_words_say_is_penalised_in_training(shapes):
-    policy = make_policy(shapes, "strong", seed=0)
-    batch = TensorDict(
-        {
-            "pixels": tiles("red circle", "blue triangle"),
-            "instruction": VOCABULARY.encode(["move to the red circle"]),
-            "action": torch.tensor([5]),
-        },
-        [1],
-    )
+    policy, data = make_policy(shapes, "strong", seed=0), batch("move to the red circle")
     loss = ImitationLoss(policy, word_penalty=1.0)
-    loss(batch)["loss_words"].backward()
+    loss(data)["loss_words"].backward()
     words = instructed_network(policy).trunk.words
-    said = words.about_form.weight.grad.abs().sum(1) > 0
-    assert said.nonzero().squeeze(1).tolist() == sorted(
-        batch["instruction"][batch["instruction"] > 0].tolist()
-    )
+    said = words.about_form.weight.grad.abs().sum(1).nonzero().squeeze(1)
+    assert said.tolist() == sorted(data["instruction"][data["instruction"] > 0].tolist())
     assert take_word_penalty(policy) is None  # taken, so that the policy can be copied
-    assert loss.eval()(batch)["loss_words"] == 0
-    assert "loss_words" not in ImitationLoss(make_policy(shapes, "paper", seed=0))(batch)
+    assert loss.eval()(data)["loss_words"] == 0
+    assert "loss_words" not in ImitationLoss(make_policy(shapes, "paper", seed=0))(data)
 
 
 def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
     policy = make_policy(shapes, "strong", seed=0)
     words = instructed_network(policy).trunk.words
-    sentences = ["move to the red circle", "move to the blue triangle"]
-    batch = TensorDict(
-        {
-            "pixels": tiles("red circle", "blue triangle").expand(2, -1, -1, -1),
-            "instruction": VOCABULARY.encode(sentences),
-            "action": torch.tensor([5, 0]),
-        },
-        [2],
-    )
+    data = batch("move to the red circle", "move to the blue triangle")
     loss = ImitationLoss(policy, words_from=0.5)
-    assert loss(batch)["loss_words"] == 0
+    assert loss(data)["loss_words"] == 0
     torch.manual_seed(0)
-    as_said = words.eval().roles(batch["instruction"])[0]
-    assert words.train().roles(batch["instruction"])[0].equal(as_said)
+    as_said = words.eval().roles(data["instruction"])[0]
+    assert words.train().roles(data["instruction"])[0].equal(as_said)
 
     loss.set_progress(0.5)
-    assert loss(batch)["loss_words"] > 0
-    assert not words.roles(batch["instruction"])[0].equal(as_said)
+    assert loss(data)["loss_words"] > 0
+    assert not words.roles(data["instruction"])[0].equal(as_said)
     loss.set_progress(0.0)  # as when training begins once more
-    assert loss(batch)["loss_words"] == 0
+    assert loss(data)["loss_words"] == 0
     ImitationLoss(policy)  # swaps from the start, whatever came before
     assert words.swaps_words
     with pytest.raises(UserError, match=r"share of training in \[0, 1\], got 2"):
@@ -168,7 +159,7 @@ def what_is_seen(trunk, image, words="red circle"):
         trunk.attention.bias.zero_()
         both = trunk(image, VOCABULARY.encode([words]))[0]
     maps, heads = 2 * trunk.words.relevance.out_channels, trunk.attention.out_features
-    turned = BEARINGS * 2 * (heads + maps) if trunk.bearing is not None else 0
+    turned = BEARINGS * 2 * (heads + maps) if trunk.around is not None else 0
     each = (len(both) - turned - 2 * maps - MODIFIER) // heads
     return both[2 : each - maps]
 
@@ -208,16 +199,11 @@ def test_bearings_turn_all_places(shapes):
 
 def test_padding_says_nothing(shapes):
     policy = make_policy(shapes, "strong", seed=0).eval()
-    tokens = VOCABULARY.encode(["move to the red circle", "put the blue diamond in the green box"])
-    image = tiles("red circle", "blue triangle").expand(2, -1, -1, -1)
-
-    def logits(words):
-        given = TensorDict({"pixels": image[: len(words)], "instruction": words}, [len(words)])
-        return policy(given)["logits"]
-
-    both = logits(tokens)
-    torch.testing.assert_close(logits(tokens[:1]), both[:1])
-    torch.testing.assert_close(logits(F.pad(tokens, (0, 9))), both)
+    data = batch("move to the red circle", "put the blue diamond in the green box")
+    both = policy(data.clone())["logits"]
+    torch.testing.assert_close(policy(data[:1].clone())["logits"], both[:1])
+    data["instruction"] = F.pad(data["instruction"], (0, 9))
+    torch.testing.assert_close(policy(data)["logits"], both)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])

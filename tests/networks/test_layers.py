@@ -1,12 +1,7 @@
 import pytest
 import torch
 
-from ifo_grounding.networks import (
-    GatedAttention,
-    GRUInstructionEncoder,
-    ResidualBlock,
-    pool_cells,
-)
+from ifo_grounding.networks import GatedAttention, GRUInstructionEncoder, ResidualBlock
 from ifo_grounding.tasks import VOCABULARY, grammar
 
 
@@ -57,8 +52,3 @@ def test_a_residual_block_by_hand():
     # mixed: 1, -1; ReLU: 1, 0; each cell sees both: 1
     found = block(torch.tensor([[[[1.0, 0.0]]]]))
     torch.testing.assert_close(found, torch.tensor([[[[1 + 1.25, 0 + 1.25]]]]))
-
-
-def test_pooling_keeps_maxima_and_means():
-    image = torch.tensor([[[[1.0, 2.0], [3.0, 6.0]], [[-1.0, -1.0], [-1.0, -5.0]]]])
-    assert pool_cells(image).tolist() == [[6.0, -1.0, 3.0, -2.0]]

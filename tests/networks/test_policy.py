@@ -71,13 +71,3 @@ def test_vmap_is_refused_with_the_option_that_avoids_it(pair, shapes):
     policy, value = pair
     with pytest.raises(UserError, match="give TorchRL's value estimators deactivate_vmap=True"):
         GAE(gamma=0.99, lmbda=0.95, value_network=value)(rollout(shapes, policy))
-
-
-def test_place_matters_to_a_policy(shapes):
-    """The head is flattened, not pooled: the same cell elsewhere is something else."""
-    policy = make_policy(shapes, seed=0, deterministic=True)
-    pixels = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
-    pixels[0, :, :8, :8] = 255
-    pixels[1, :, 40:, 40:] = 255
-    logits = policy(TensorDict({"pixels": pixels, "instruction": torch.ones(2, 16)}, [2]))["logits"]
-    assert (logits[0] - logits[1]).abs().max() > 1e-3

@@ -12,40 +12,31 @@ def images():
     return render(random_layout(64, generator=torch.Generator().manual_seed(0)))
 
 
-@pytest.fixture
-def searches(monkeypatch):
-    """Count how often rows are compared with one another."""
-    found = []
-    search = patches.distinct_rows
-    monkeypatch.setattr(patches, "distinct_rows", lambda rows: found.append(rows) or search(rows))
-    return found
-
-
-def encoder_of(kind):
+@pytest.fixture(params=[lambda: ConvEncoder(3, 8, 4), lambda: PatchEncoder(3, 8, 8)])
+def encoder(request):
     torch.manual_seed(0)
-    if kind is ConvEncoder:
-        return ConvEncoder(3, 8, 4)
-    return PatchEncoder(3, 8, 8)
+    return request.param()
 
 
-@pytest.mark.parametrize("kind", [ConvEncoder, PatchEncoder])
-def test_a_second_network_does_not_search_the_same_images_again(kind, images, searches):
-    first, second = encoder_of(kind), encoder_of(kind)
-    first(images)
+def test_a_second_network_does_not_search_the_same_images_again(encoder, images, monkeypatch):
+    searches, search = [], patches.distinct_rows
+    monkeypatch.setattr(patches, "distinct_rows", lambda rows: searches.append(1) or search(rows))
+    found = encoder(images)
     assert searches
     searches.clear()
-    again = second(images.clone())
+    again = encoder(images.clone())
     assert not searches
-    second(images[1:])  # forgets them
+    encoder(images[1:])  # forgets them
     searches.clear()
-    torch.testing.assert_close(again, second(images))
+    torch.testing.assert_close(again, encoder(images))
+    torch.testing.assert_close(again, found)
     assert searches
 
 
-@pytest.mark.parametrize("kind", [ConvEncoder, PatchEncoder])
-def test_images_that_change_in_place_are_searched_again(kind, images):
-    encoder = encoder_of(kind)
+def test_images_may_change_in_place_and_begin_anywhere_in_a_buffer(encoder, images):
     before = encoder(images)
+    buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), images.flatten()])
+    torch.testing.assert_close(encoder(buffer[3:].view_as(images)), before)
     images[3] = images[4]
     changed = encoder(images)
     torch.testing.assert_close(changed[3], before[4])
@@ -58,10 +49,3 @@ def test_what_inference_mode_finds_is_not_kept_for_training(images):
         encoder(images)
     encoder(images).sum().backward()  # tensors of inference mode cannot be saved for this
     assert encoder.convolutions[0].weight.grad.abs().sum() > 0
-
-
-@pytest.mark.parametrize("kind", [ConvEncoder, PatchEncoder])
-def test_images_may_begin_anywhere_in_a_buffer(kind, images):
-    encoder = encoder_of(kind)
-    buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), images.flatten()])
-    torch.testing.assert_close(encoder(buffer[3:].view_as(images)), encoder(images))

@@ -78,10 +78,10 @@ def test_padding_changes_nothing(encoder):
     torch.testing.assert_close(mixed[:1], encoder(tokens))
 
 
-@pytest.mark.parametrize("bad", [-1, 40])
-def test_ids_outside_the_vocabulary_are_refused(encoder, bad):
-    with pytest.raises(UserError, match=r"knows 0 to 39"):
-        encoder(torch.tensor([[1, bad, 2]]))
+def test_ids_outside_the_vocabulary_are_refused(encoder):
+    for bad in (-1, 40):
+        with pytest.raises(UserError, match=r"knows 0 to 39"):
+            encoder(torch.tensor([[1, bad, 2]]))
 
 
 def test_each_distinct_instruction_is_encoded_once(encoder, monkeypatch):

@@ -14,7 +14,9 @@ from ifo_grounding.networks import (
     make_value,
     word_scoring,
 )
-from ifo_grounding.networks.warm_start import inherited, instructed_network
+from ifo_grounding.networks.trunk import instructed_network
+from ifo_grounding.networks.warm_start import inherited
+from networks.test_cells import every_cell_for_itself
 
 SCORERS = [make_instruction_classifier, make_goal_classifier]
 EVERY = [make_value, make_reward_model, *SCORERS]
@@ -58,7 +60,7 @@ def test_a_classifier_of_paper_copies_sentences_gates_and_the_last_image(shapes,
 
 @pytest.mark.parametrize("make", SCORERS)
 def test_a_classifier_of_strong_copies_what_words_mean(shapes, make, monkeypatch):
-    monkeypatch.setattr(word_scoring, "hidden_from_python", lambda tensor: True)  # cell by cell
+    monkeypatch.setattr(word_scoring, "group_cells", every_cell_for_itself)
     policy = make_policy(shapes, seed=0)
     classifier = make(shapes, init_from=policy, seed=1)
     tokens = torch.randint(1, shapes.vocabulary_size, (4, shapes.instruction_length))
@@ -82,8 +84,5 @@ def test_a_classifier_of_strong_copies_what_words_mean(shapes, make, monkeypatch
 def test_roles_of_words_are_copied_where_asked(shapes):
     policy = make_policy(shapes, seed=0)
     classifier = make_instruction_classifier(shapes, init_from=policy, roles=True, seed=1)
-    own, theirs = (
-        classifier.module.words.state_dict(),
-        instructed_network(policy).trunk.words.state_dict(),
-    )
-    assert all(torch.equal(own[name], weight) for name, weight in theirs.items())
+    own, theirs = classifier.module.words, instructed_network(policy).trunk.words
+    assert all(map(torch.equal, own.state_dict().values(), theirs.state_dict().values()))

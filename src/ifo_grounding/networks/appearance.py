@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.networks.patches import as_float, distinct_patches, patches
+from ifo_grounding.networks.patches import as_float, cells_of
 
 EVIDENCE = 16
 """Size of what a word is compared with."""
@@ -42,7 +42,7 @@ class ColourAndForm(nn.Module):
 
     def __init__(self, channels: int, features: int, patch: int) -> None:
         super().__init__()
-        self.channels, self.patch = channels, patch
+        self.patch = patch
         half = features // 2
         self.pixel = nn.Sequential(
             nn.Linear(channels, half), nn.ReLU(), nn.Linear(half, half), nn.ReLU()
@@ -55,18 +55,14 @@ class ColourAndForm(nn.Module):
 
     def forward(self, image: Tensor) -> Appearance:
         """See an image [N, C, H, W], its distinct cells once."""
-        tiles, where = self.tiles(image)
+        tiles, where = cells_of(image, self.patch)
+        tiles = as_float(tiles, self.colour.weight)
         pixels = tiles.transpose(1, 2)  # [U, P * P, C]
         colour = self.colour(self.pixel(pixels).amax(1))
         edges = self.edges(tiles)
         form = self.form(F.relu(self.outline(edges)))
-        size = (EVIDENCE,)
-        return Appearance(
-            F.layer_norm(colour, size),
-            F.layer_norm(form, size),
-            F.relu(self.silhouette(edges)),
-            where,
-        )
+        colour, form = (F.layer_norm(seen, (EVIDENCE,)) for seen in (colour, form))
+        return Appearance(colour, form, F.relu(self.silhouette(edges)), where)
 
     def edges(self, tiles: Tensor) -> Tensor:
         """Say where pixels differ from the next one, whatever their colours: [U, 2 P (P - 1)]."""
@@ -74,12 +70,3 @@ class ColourAndForm(nn.Module):
         across = square.diff(dim=-1).abs().amax(1).flatten(1)
         down = square.diff(dim=-2).abs().amax(1).flatten(1)
         return torch.tanh(CONTRAST * torch.cat([across, down], 1))
-
-    def tiles(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Cut [N, C, H, W] into cells [U, C, P * P], and say which lies where [N, h * w]."""
-        weight, found = self.colour.weight, distinct_patches(image, self.patch)
-        if found is not None:
-            return as_float(found[0], weight), found[1]
-        every = as_float(patches(image, self.patch), weight)  # [N, h, w, C * P * P]
-        tiles = every.flatten(0, 2).unflatten(-1, (image.shape[1], -1))
-        return tiles, torch.arange(len(tiles), device=image.device).view(len(image), -1)

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
-from ifo_grounding.networks.shapes import Shapes, patch_size
+from ifo_grounding.networks.shapes import Shapes, grid_of
 
 
 class ImageNetwork(nn.Module):
@@ -20,11 +19,7 @@ class ImageNetwork(nn.Module):
         super().__init__()
         self.shapes = shapes
         self.config = config
-        _, height, width = shapes.image_shape
-        if config.preset == "paper":
-            self.grid = ConvEncoder.grid(height, width, config.conv_layers)
-        else:
-            self.grid = PatchEncoder.grid(height, width, patch_size(shapes, config))
+        self.grid = grid_of(shapes, config)
 
     def flat_pixels(self, pixels: Tensor) -> tuple[Tensor, torch.Size]:
         """Return pixels [*B, C, H, W] as [N, C, H, W], and B.

@@ -1,9 +1,8 @@
 """Cells that look alike are computed once.
 
 Where no cell of a feature map sees another, what is computed for a cell depends on its picture
-alone. Worlds made of tiles show the same few pictures again and again: a batch of 512 images of 36
-cells holds some 300 different ones. So each is computed once and looked up wherever it is needed.
-The result is the same up to rounding.
+alone, and worlds made of tiles show the same few pictures again and again. So each is computed once
+and looked up wherever it is needed. The result is the same up to rounding.
 """
 
 from __future__ import annotations
@@ -46,9 +45,8 @@ def group_cells(index: Tensor, known: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         known: what else is known of each cell, such as its place, [N, C, D].
 
     Returns:
-        Of each map's groups: which distinct cell, int64 [N, J]; how many places show it, [N, J], 0
-        where a map has fewer than J kinds of cells; and the mean of what is known of these places,
-        [N, J, D].
+        Of each map's groups: which distinct cell, int64 [N, J]; in how many places it lies, [N, J],
+        0 where a map has fewer groups; and the mean of what is known of these places, [N, J, D].
 
     >>> cell, number, mean = group_cells(torch.tensor([[4, 7, 4]]), torch.eye(3)[None, :, :2])
     >>> cell.tolist(), number.tolist(), mean.tolist()
@@ -88,8 +86,7 @@ def distinct_pairs(
         n_second: bound of the second.
 
     Returns:
-        The first and the second number of each distinct pair, int64 [P] each, and which pair lies
-        where, int64 [*B].
+        The two numbers of each distinct pair, int64 [P] each, and which pair lies where, [*B].
 
     >>> [part.tolist() for part in distinct_pairs(torch.tensor([3, 1, 3]), torch.tensor(2), 4, 3)]
     [[1, 3], [2, 2], [1, 0, 1]]

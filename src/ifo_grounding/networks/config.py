@@ -5,10 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from ifo_grounding.errors import UserError, check_choice, check_numbers
+from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 
-KINDS = ("inverse", "policy", "value", "instruction", "reward", "goal")
-"""The networks of this package."""
+INPUTS = {
+    "inverse": ("image", "next image"),
+    "policy": ("image", "instruction"),
+    "value": ("image", "instruction"),
+    "instruction": ("image", "instruction"),
+    "reward": ("image", "instruction", "action"),
+    "goal": ("first image", "image", "instruction"),
+}
+"""The networks of this package, and what each reads, in the order of its ``in_keys``."""
 ONLY_IN = {
     **dict.fromkeys(("conv_layers", "embedding", "sentence_rate", "sentence_pooling"), "paper"),
     **dict.fromkeys(("patch_size", "context", "heads", "values", "maps"), "strong"),
@@ -68,24 +75,22 @@ class NetworkConfig:
         check_choice("sentence_pooling", self.sentence_pooling, ("last", "mean"))
         check_choice("precision", self.precision, (None, "fp32", "bf16"))
         check_numbers(self)
+        sizes = ("features", "hidden", "conv_layers", "embedding", "patch_size", "maps")
+        check_range(self, *sizes, least=1)
+        check_range(self, "context", "heads", "values", "dropout", least=0)
+        check_range(self, "sentence_rate", above=0, most=1)
+        if self.dropout >= 1:
+            raise UserError(f"dropout must be below 1, got {self.dropout}")
         object.__setattr__(self, "head_hidden", tuple(self.head_hidden))
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.type in ("int", "int | None") and value is not None:
-                least = 0 if field.name in ("context", "heads", "values") else 1
-                if value < least:
-                    raise UserError(f"{field.name} must be at least {least}, got {value}")
-            if ONLY_IN.get(field.name, self.preset) != self.preset and value != field.default:
-                raise UserError(
-                    f"{field.name} is an option of preset {ONLY_IN[field.name]!r} alone, and this "
-                    f"network is of {self.preset!r}: leave it out"
-                )
-        if not 0 < self.sentence_rate <= 1:
-            raise UserError(f"sentence_rate must lie in (0, 1], got {self.sentence_rate}")
-        if not 0 <= self.dropout < 1:
-            raise UserError(f"dropout must lie in [0, 1), got {self.dropout}")
         if any(size < 1 for size in self.head_hidden):
             raise UserError(f"sizes in head_hidden must be at least 1, got {self.head_hidden}")
+        for field in fields(self):
+            only = ONLY_IN.get(field.name, self.preset)
+            if only != self.preset and getattr(self, field.name) != field.default:
+                raise UserError(
+                    f"{field.name} is an option of preset {only!r} alone, and this network is of "
+                    f"{self.preset!r}: leave it out"
+                )
 
     @classmethod
     def of(cls, kind: str, preset: str = "strong", **overrides: Any) -> NetworkConfig:
@@ -94,7 +99,7 @@ class NetworkConfig:
         Raises:
             UserError: for an unknown kind, preset or name of a value.
         """
-        check_choice("kind of network", kind, KINDS)
+        check_choice("kind of network", kind, INPUTS)
         check_choice("preset", preset, PRESETS)
         names = [field.name for field in fields(cls) if field.name != "preset"]
         for name in overrides:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import torch
@@ -10,13 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.networks.cells import look_up
-from ifo_grounding.networks.layers import init_before_relu
+from ifo_grounding.networks.layers import convolutions, init_before_relu
 from ifo_grounding.networks.patches import (
     Windows,
     as_float,
-    distinct_patches,
+    cells_of,
     distinct_views,
-    patches,
 )
 
 
@@ -33,14 +31,7 @@ class ConvEncoder(nn.Module):
 
     def __init__(self, channels: int, features: int, layers: int) -> None:
         super().__init__()
-        sizes = [channels] + [features] * layers
-        self.layers = nn.Sequential(
-            *(
-                part
-                for before, after in itertools.pairwise(sizes)
-                for part in (nn.Conv2d(before, after, 3, stride=2, padding=1), nn.ReLU())
-            )
-        )
+        self.layers = convolutions(channels, *[features] * layers, stride=2)
         for layer in self.convolutions:
             init_before_relu(layer)
 
@@ -62,13 +53,6 @@ class ConvEncoder(nn.Module):
         rest = self.layers[2 * (2 + len(views.blocks)) :]
         return rest(look_up(features, views.where).movedim(-1, 1))
 
-    @staticmethod
-    def grid(height: int, width: int, layers: int) -> tuple[int, int]:
-        """Return the size of the feature map of an image."""
-        for _ in range(layers):
-            height, width = (height + 1) // 2, (width + 1) // 2
-        return height, width
-
 
 def _two_layers(first: nn.Conv2d, second: nn.Conv2d, windows: Windows) -> Tensor:
     """Map windows to what two convolutions of kernel 3 and stride 2 make of each, [U, F]."""
@@ -89,17 +73,14 @@ def _on_blocks(layer: nn.Conv2d, seen: Tensor) -> Tensor:
 class PatchEncoder(nn.Module):
     """One feature vector per patch, the same wherever the patch lies.
 
-    A linear layer of rearranged pixels, which trains faster on a CPU than a strided convolution:
-    bytes are cheaper to rearrange than floats, and the layout fits the convolutions that follow.
-    An image whose sides are not multiples of the patch is padded with black to the right and below.
-    Where patches of bytes repeat, each distinct one is embedded once.
+    A strided convolution, as a linear layer of distinct patches: bytes are cheaper to rearrange
+    than floats, and the layout fits the convolutions that follow.
 
     Args:
         channels: what :attr:`complete` makes of an image's channels.
         features: F.
         patch: pixels along one side of a patch.
-        complete: makes what is embedded of images or distinct patches, [N, C, ...]; by default they
-            are embedded as they are.
+        complete: makes what is embedded of patches [U, C, P * P]; by default they are as they are.
 
     >>> PatchEncoder(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48)).shape
     torch.Size([2, 64, 6, 6])
@@ -118,25 +99,16 @@ class PatchEncoder(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """Map an image [N, C, H, W] to features [N, F, h, w], channels last in memory."""
-        found = distinct_patches(image, self.patch)
-        if found is not None:
-            height, width = image.shape[-2:]
-            return self.look_up(*found, self.grid(height, width, self.patch))
-        cut = as_float(patches(self.complete(image), self.patch), self.embed.weight)
-        return self.embed(cut).permute(0, 3, 1, 2)
+        grid = -(-image.shape[-2] // self.patch), -(-image.shape[-1] // self.patch)
+        return self.look_up(*cells_of(image, self.patch), grid)
 
-    def look_up(self, distinct: Tensor, index: Tensor, grid: tuple[int, int]) -> Tensor:
-        """Embed distinct patches [U, C, P * P] once, and look them up: [N, F, h, w].
+    def look_up(self, patches: Tensor, index: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Embed patches [U, C, P * P] once, and look them up: [N, F, h, w].
 
         Args:
-            distinct: of bytes.
+            patches: distinct ones.
             index: which of them lies where, int64 [N, h * w].
             grid: h and w.
         """
-        pixels = as_float(self.complete(distinct).flatten(1), self.embed.weight)
+        pixels = as_float(self.complete(patches).flatten(1), self.embed.weight)
         return look_up(self.embed(pixels), index).unflatten(1, grid).movedim(-1, 1)
-
-    @staticmethod
-    def grid(height: int, width: int, patch: int) -> tuple[int, int]:
-        """Return the number of patches down and across an image."""
-        return -(-height // patch), -(-width // patch)

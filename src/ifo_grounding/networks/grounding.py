@@ -1,14 +1,13 @@
 """Words that each say something about a cell, so that new combinations of them mean something.
 
-An extension of the paper. A network whose instruction is one vector learns each sentence for
-itself: an object that no demonstration goes for is never a target, whatever it is called. Here an
-instruction reaches the policy only through maps of *where*, to which each word adds its own
-evidence about each cell; and walking and stopping see forms and those maps alone.
+An extension of the paper, whose networks learn each sentence for itself: an object that no
+demonstration goes for is never a target, whatever it is called. Here an instruction reaches the
+policy only through maps of *where*, to which each word adds its own evidence about each cell; and
+walking and stopping see forms and those maps alone.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any
 
@@ -16,13 +15,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.networks.appearance import EVIDENCE, Appearance, ColourAndForm
 from ifo_grounding.networks.cells import cell_places, look_up
 from ifo_grounding.networks.config import NetworkConfig
-from ifo_grounding.networks.encoders import PatchEncoder
+from ifo_grounding.networks.layers import convolutions
 from ifo_grounding.networks.sentences import without_padding
-from ifo_grounding.networks.shapes import Shapes, patch_size
+from ifo_grounding.networks.shapes import Shapes, grid_of, patch_size
 
 ROLE, SIDE = 8, 4
 """Sizes of the codes from which a word's role and the modifier are read."""
@@ -51,16 +49,15 @@ class WordMaps(nn.Module):
     roles are read from instructions whose words were swapped (:func:`swap_words`), so that they
     cannot depend on which colour or form is meant.
 
-    Attributes:
-        word_penalty: a regulariser of word evidence, left by each batch of training: over the words
-            that it says, the spread over cells of the evidence about colours plus that of the
-            evidence about form. A loss that adds it makes a word speak about one of the two.
-        swaps_words: whether training swaps words. While words are still being found, a role that
-            others make uncertain can keep them from it.
     """
 
+    word_penalty: Tensor | None = None
+    """Left by each batch of training: over the words that it says, the spread over cells of the
+    evidence about colours plus that about form. A loss that adds it makes a word speak about one of
+    the two."""
     swaps_words = True
-
+    """Whether training swaps words. While they are still being found, a role that others make
+    uncertain can keep them from it."""
     usual: Tensor
     """How much each word usually counts for each map, which tells nothing: [V, maps]."""
 
@@ -74,13 +71,11 @@ class WordMaps(nn.Module):
         self.beside = nn.Conv1d(ROLE, hidden, 5, padding=2)
         self.relevance = nn.Conv1d(hidden, maps, 5, padding=2)
         nn.init.normal_(self.relevance.weight, std=1 / math.sqrt(5 * hidden))
-        assert self.relevance.bias is not None
-        nn.init.zeros_(self.relevance.bias)
+        self.relevance.bias.data.zero_()  # type: ignore[union-attr]
         self.side = nn.Embedding(vocabulary_size, SIDE)
         self.around = nn.Conv1d(SIDE, hidden, 5, padding=2)
         self.modifier = nn.Linear(hidden, MODIFIER)
         self.register_buffer("usual", torch.zeros(vocabulary_size, maps))
-        self.word_penalty: Tensor | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: not the penalty, a part of a graph."""
@@ -88,10 +83,12 @@ class WordMaps(nn.Module):
 
     def forward(self, seen: Appearance, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps' logits [N, maps, h * w] and the modifier [N, MODIFIER]."""
-        used = self._in_use(tokens)
+        counts = (self.usual != 0).any(1)
+        counts[tokens] = True  # of the others no evidence is needed
+        used = counts.nonzero().squeeze(1)
         colour, form = self.evidence(seen, used)
         spoken, modifier = self.listen(tokens, used)
-        if self.training and used is not None:
+        if self.training:
             said = torch.zeros(len(self.usual), dtype=torch.bool, device=tokens.device)
             said[tokens] = True
             said[0] = False
@@ -100,11 +97,11 @@ class WordMaps(nn.Module):
         return spoken.transpose(1, 2) @ evidence.transpose(1, 2), modifier
 
     def evidence(self, seen: Appearance, used: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return what words say of the colours and of the form of each cell, [U, V] each.
+        """Return what words, by default all, say of colours and of form of each cell, [U, V] each.
 
         Args:
             seen: distinct cells.
-            used: the words, int64 [V]; None means the whole vocabulary.
+            used: the words, int64 [V].
         """
         about = [self.about_colour.weight, self.about_form.weight]
         colour, form = about if used is None else [look_up(words, used) for words in about]
@@ -117,7 +114,7 @@ class WordMaps(nn.Module):
 
         Args:
             tokens: token ids [N, L].
-            used: words of which all others count nothing, int64 [V]; None means all words.
+            used: the words, by default all, int64 [V]; the others count nothing.
         """
         weights, modifier = self.roles(tokens)
         usual = self.usual if used is None else self.usual[used]
@@ -127,18 +124,10 @@ class WordMaps(nn.Module):
             tokens = number[tokens]
         spoken = weights.new_zeros(len(tokens), len(usual), weights.shape[-1])
         spoken = spoken.scatter_add(1, tokens.unsqueeze(-1).expand_as(weights), weights)
-        if self.training and len(tokens) and not hidden_from_python(tokens):
+        if self.training and len(tokens):
             usual = usual.lerp(spoken.detach().float().mean(0).to(usual.dtype), PACE)
             self.usual[slice(None) if used is None else used] = usual
         return spoken - usual.to(spoken.dtype), modifier
-
-    def _in_use(self, tokens: Tensor) -> Tensor | None:
-        """Return the words that count anything, said now or before; None where that is unknown."""
-        if not tokens.numel() or hidden_from_python(tokens) or hidden_from_python(self.usual):
-            return None
-        counts = (self.usual != 0).any(1)
-        counts[tokens] = True
-        return counts.nonzero().squeeze(1)
 
     def roles(self, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return how much words count for each map [N, L, maps], and the modifier [N, MODIFIER]."""
@@ -156,11 +145,7 @@ class WordMaps(nn.Module):
 
 
 def swap_words(tokens: Tensor, share: float) -> Tensor:
-    """Swap words for those at the same place of another instruction of the batch, as long.
-
-    Args:
-        tokens: int64 [N, L].
-        share: of the words that are swapped.
+    """Swap a share of the words [N, L] for those of another instruction of the batch, as long.
 
     >>> tokens = torch.tensor([[1, 2, 3, 0], [1, 5, 6, 0], [7, 0, 0, 0]])
     >>> swap_words(tokens, 1.0).tolist()
@@ -181,53 +166,42 @@ def swap_words(tokens: Tensor, share: float) -> Tensor:
 class GroundedTrunk(nn.Module):
     """Where an instruction points, where the arm and the like are, and how the two go together.
 
-    Attention maps of two kinds read the image. Those of :class:`WordMaps` give places and nothing
-    else; each is read as evidence for places and as evidence against them, for which of the two
-    finds its target is a matter of chance. The others see silhouettes and no words, and give
-    places, what is seen there, and how much of each word map lies there. With ``context`` they also
-    give which forms and word maps lie around their places, such as a wall or the target before the
-    agent, and all places times a few features of what is seen: to whom faces east, what lies in the
-    north is on the left.
+    Attention maps of two kinds read the image. Those of :class:`WordMaps` give places alone; each
+    is read as evidence for and against them, for which of the two finds its target is a matter of
+    chance. The others see silhouettes and no words, and give places, what is seen there, and how
+    much of each word map lies there. With ``context`` they also give which forms and word maps lie
+    around, such as the target before the agent, and all places times a few features of what is
+    seen: to whom faces east, what lies in the north is on the left.
     """
 
     place: Tensor
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__()
-        channels, height, width = shapes.image_shape
-        patch = patch_size(shapes, config)
-        self.appearance = ColourAndForm(channels, config.features, patch)
+        channels = shapes.image_shape[0]
+        self.appearance = ColourAndForm(channels, config.features, patch_size(shapes, config))
         self.words = WordMaps(shapes.vocabulary_size, config.maps, config.hidden)
         self.attention = nn.Linear(config.features, config.heads)
         nn.init.normal_(self.attention.weight, std=8 / math.sqrt(config.features))
         self.value = nn.Linear(config.features, config.values)
         self.around: nn.Sequential | None = None
-        self.bearing: nn.Linear | None = None
         seen, maps = config.values, 2 * config.maps
+        self.size = config.heads * (2 + seen + maps) + 2 * maps + MODIFIER
         if config.context:
             self.form = nn.Linear(config.features, FORMS)
-            sizes = (FORMS + maps, *[AROUND] * config.context)
-            layers = (
-                layer
-                for before, after in itertools.pairwise(sizes)
-                for layer in (nn.Conv2d(before, after, 3, padding=1), nn.ReLU())
-            )
-            self.around = nn.Sequential(*layers)
-            seen += AROUND
-            self.bearing = nn.Linear(config.heads * seen, BEARINGS)
-            nn.init.normal_(self.bearing.weight, std=4 / math.sqrt(config.heads * seen))
-        self.grid = PatchEncoder.grid(height, width, patch)
+            self.around = convolutions(FORMS + maps, *[AROUND] * config.context)
+            known = config.heads * (seen + AROUND)
+            self.bearing = nn.Linear(known, BEARINGS)
+            nn.init.normal_(self.bearing.weight, std=4 / math.sqrt(known))
+            self.size += config.heads * AROUND + BEARINGS * 2 * (config.heads + maps)
+        self.grid = grid_of(shapes, config)
         self.register_buffer("place", cell_places(self.grid), persistent=False)
-        self.size = config.heads * (2 + seen + maps) + 2 * maps + MODIFIER
-        if self.bearing is not None:
-            self.size += BEARINGS * 2 * (config.heads + maps)
 
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
-        if tokens.numel() and not hidden_from_python(tokens):
-            tokens = without_padding(tokens, self.words.role.num_embeddings)
         cells = self.appearance(image)
-        logits, modifier = self.words(cells, tokens.long())
+        tokens = without_padding(tokens.long(), self.words.role.num_embeddings)
+        logits, modifier = self.words(cells, tokens)
         maps = weigh(logits)
         silent = torch.cat([self.attention(cells.silhouette), self.value(cells.silhouette)], -1)
         silent = look_up(silent, cells.where)
@@ -241,7 +215,7 @@ class GroundedTrunk(nn.Module):
         own, pointed, seen = attention @ place, maps @ place, attention @ silent[..., heads:]
         read = torch.cat([own, seen, attention @ maps.transpose(1, 2)], -1)
         known = [read.flatten(1), pointed.flatten(1), modifier]
-        if self.bearing is not None:
+        if self.around is not None:
             bearing = torch.tanh(self.bearing(seen.flatten(1)))
             places = torch.cat([own, pointed], 1).flatten(1)
             known.append((bearing.unsqueeze(-1) * places.unsqueeze(1)).flatten(1))
@@ -267,13 +241,7 @@ def over_words(layer: nn.Conv1d, words: Tensor) -> Tensor:
 
 
 def surroundings(layers: nn.Module, shown: Tensor, grid: tuple[int, int]) -> Tensor:
-    """Return what lies around each cell, [N, h * w, AROUND].
-
-    Args:
-        layers: convolutions over the cells, [N, F, h, w] to [N, AROUND, h, w].
-        shown: what cells show their neighbours, [N, h * w, F].
-        grid: h and w.
-    """
+    """Return what convolutions see around each cell, [N, h * w, AROUND], of [N, h * w, F]."""
     around: Tensor = layers(shown.unflatten(1, grid).movedim(-1, 1))
     return around.flatten(2).transpose(1, 2)
 

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
 
 import torch
 import torch.nn.functional as F
-from tensordict.nn import TensorDictModule
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from ifo_grounding import keys
 from ifo_grounding.networks.base import ImageNetwork, same_batch
-from ifo_grounding.networks.building import build
 from ifo_grounding.networks.cells import distinct_pairs
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
@@ -59,15 +53,12 @@ class InverseNetwork(ImageNetwork):
         return self.image.patch == tile_size
 
     def from_tiles(self, tiles: Tensor, before: Tensor, after: Tensor) -> Tensor:
-        """Compute what :meth:`forward` does of the pictures that tiles make, without making them.
+        """Map the pictures that tiles make to logits, float32 [N, A], without making them.
 
         Args:
             tiles: distinct tiles as large as this network's patches, uint8 [K, C, T, T].
             before: which tile lies where in the images before, integer [N, h, w].
             after: the same of the images after.
-
-        Returns:
-            Logits, float32 [N, A].
         """
         assert isinstance(self.image, PatchEncoder)
         codes = before.flatten(1).long(), after.flatten(1).long()
@@ -89,36 +80,3 @@ def _with_change(both: Tensor) -> Tensor:
     """Lay on top of two images [N, 2 C, ...] how far each pixel changed: [N, 3 C, ...]."""
     before, after = both.chunk(2, 1)
     return torch.cat([both, torch.maximum(before, after) - torch.minimum(before, after)], 1)
-
-
-def make_inverse(
-    spec_source: Any,
-    preset: str = "strong",
-    *,
-    in_keys: Sequence[NestedKey] = (keys.PIXELS, (keys.NEXT, keys.PIXELS)),
-    out_key: NestedKey = keys.LOGITS,
-    device: torch.device | str | None = None,
-    seed: int | None = None,
-    **overrides: Any,
-) -> TensorDictModule:
-    """Build the inverse module: two images to logits of the actions, float32 [*B, A].
-
-    Args:
-        spec_source: an env, a dataset or a :class:`~ifo_grounding.networks.Shapes`.
-        preset: ``"strong"`` or ``"paper"``.
-        in_keys: the image before and the image after, uint8 [*B, C, H, W].
-        out_key: where the logits go.
-        device: where to build it.
-        seed: makes the initial weights a function of the seed alone.
-        overrides: values of :class:`~ifo_grounding.networks.NetworkConfig` to replace.
-
-    Raises:
-        UserError: for an unknown preset or option, or sizes that cannot be read.
-
-    >>> inverse = make_inverse(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
-    >>> frame = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
-    >>> inverse(pixels=frame, next_pixels=frame).shape
-    torch.Size([2, 6])
-    """
-    options = {"in_keys": in_keys, "out_key": out_key}
-    return build("inverse", InverseNetwork, spec_source, preset, options, device, seed, overrides)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import torch
@@ -27,9 +28,8 @@ class GatedAttention(nn.Module):
         instruction_size: D, the size of an encoded instruction.
         features: F, the channels of the feature map.
         rate: how fast h learns, relative to the rest of the network: its weights are kept divided
-            by it. What is learned first, such as colours, drives gates that learn as fast as all
-            else to where a sigmoid hardly learns any more, and sentences that differ in what is to
-            be learned later, such as shapes, share their gates by then.
+            by it. Gates that learn as fast as all else saturate on what is learned first, such as
+            colours, before they tell shapes apart.
 
     >>> gate = GatedAttention(instruction_size=128, features=32)
     >>> gate(torch.ones(2, 32, 3, 3), torch.zeros(2, 128)).shape
@@ -83,6 +83,14 @@ def pool_cells(image: Tensor) -> Tensor:
 def flatten_cells(features: Tensor) -> Tensor:
     """Flatten [N, F, h, w] to [N, h * w * F], the order in which it lies in memory."""
     return features.permute(0, 2, 3, 1).flatten(1)
+
+
+def convolutions(*sizes: int, stride: int = 1) -> nn.Sequential:
+    """Return convolutions of kernel 3 and padding 1 from size to size, and a ReLU after each."""
+    layers: list[nn.Module] = []
+    for before, after in itertools.pairwise(sizes):
+        layers += [nn.Conv2d(before, after, 3, stride, padding=1), nn.ReLU()]
+    return nn.Sequential(*layers)
 
 
 def init_before_relu(layer: nn.Conv2d | nn.Linear) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
 from ifo_grounding.mosaic import as_words
 
@@ -23,50 +22,43 @@ MOST_TILES = 1 << 15
 MOST_REMEMBERED = 1 << 26
 """Bytes of images up to which it is remembered what was found in them."""
 
-Found = TypeVar("Found")
+Find = TypeVar("Find", bound=Callable[[Tensor, int], Any])
 
 
-def remembered(
-    find: Callable[[Tensor, int], Found | None],
-) -> Callable[[Tensor, int], Found | None]:
+def remembered(find: Find) -> Find:
     """Keep what was found in the last images, for whoever asks about the same ones next.
 
-    Actor and critic, or policy and reward model, read the same images one after the other. To keep
-    a copy of these and to compare all bytes takes a twentieth of the time of finding what repeats.
+    Actor and critic, or policy and reward model, read the same images one after the other. To
+    compare them takes a twentieth of the time of finding what repeats.
     """
-    last: tuple[Tensor, tuple[int, torch.Size], Found] | None = None
+    last: tuple[int, Tensor, Any] | None = None
 
     @functools.wraps(find)
-    def recall(image: Tensor, number: int) -> Found | None:
+    def recall(image: Tensor, number: int) -> Any:
         nonlocal last
         if not is_plain(image) or torch.is_inference_mode_enabled():
             return find(image, number)
         # Words are compared many times as fast as bytes.
         words = image if image.shape[-1] % WORD else as_words(image)
-        known, asked = last, (number, image.shape)
-        if known is not None and known[1] == asked and torch.equal(known[0], words):
-            return known[2]
+        if last is not None and last[0] == number and torch.equal(last[1], words):
+            return last[2]
         found = find(image, number)
-        if found is not None and image.nbytes <= MOST_REMEMBERED:
-            last = words.clone(), asked, found
+        if image.nbytes <= MOST_REMEMBERED:
+            last = number, words.clone(), found
         return found
 
-    return recall
+    return recall  # type: ignore[return-value]
 
 
 def is_plain(image: Tensor) -> bool:
     """Whether images are bytes on a CPU, which can be compared there and then."""
-    plain = image.dtype == torch.uint8 and image.device.type == "cpu"
-    return plain and not hidden_from_python(image)
+    return image.dtype == torch.uint8 and image.device.type == "cpu"
 
 
 def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
     """Return pixels in the precision of the weights that read them.
 
-    Bytes are scaled to [0, 1]; floating-point pixels are taken as scaled already.
-
-    Raises:
-        UserError: for other whole numbers, which may be scaled or not.
+    Bytes are scaled to [0, 1], floats are taken as scaled already, and other numbers are refused.
     """
     if pixels.dtype == torch.uint8:
         return pixels.to(weight.dtype).mul_(1 / 255)
@@ -78,54 +70,42 @@ def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
     return pixels.to(weight.dtype)
 
 
-def patches(image: Tensor, patch: int) -> Tensor:
-    """Cut an image [N, C, H, W] into patches [N, h, w, C * patch * patch].
-
-    An image whose sides are not multiples of the patch is padded with black to the right and below.
-
-    >>> patches(torch.zeros(2, 3, 20, 28), 8).shape
-    torch.Size([2, 3, 4, 192])
-    """
-    return _cut(_padded(image, patch), patch, patch)
-
-
 @remembered
-def distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
-    """Cut images into their distinct patches; None where that would not pay.
+def cells_of(image: Tensor, patch: int) -> tuple[Tensor, Tensor]:
+    """Cut images into cells, those that look alike once where that pays.
 
-    It pays on a CPU, for images of bytes in which more than half of the patches repeat.
+    It pays on a CPU, for bytes of which half or more repeat. Images whose sides are not multiples
+    of the patch are padded with black to the right and below.
 
     Args:
         image: [N, C, H, W].
-        patch: pixels along one side of a patch.
+        patch: pixels along one side of a cell.
 
     Returns:
-        Distinct patches, uint8 [U, C, patch * patch], and which lies where, int64 [N, h * w].
+        Cells, of the image's type, [U, C, patch * patch], and which lies where, int64 [N, h * w].
+
+    >>> cells, where = cells_of(torch.zeros(2, 3, 20, 28, dtype=torch.uint8), 8)
+    >>> cells.shape, where.shape
+    (torch.Size([1, 3, 64]), torch.Size([2, 12]))
     """
-    return _distinct_patches(image, patch)
-
-
-def _distinct_patches(image: Tensor, patch: int) -> tuple[Tensor, Tensor] | None:
-    if not is_plain(image) or patch % WORD:
-        return None
-    words = as_words(_padded(image, patch))
-    cut = _cut(words, patch, patch // WORD)
-    rows, index = distinct_rows(cut.flatten(0, 2))
-    if 2 * len(rows) > len(index):
-        return None
-    distinct = rows.view(torch.uint8).unflatten(1, (-1, patch**2))
-    return distinct, index.view(cut.shape[:3]).flatten(1)
+    below, right = (-size % patch for size in image.shape[-2:])
+    image = F.pad(image, (0, right, 0, below)) if below or right else image
+    if is_plain(image) and not patch % WORD:
+        cut = _cut(as_words(image), patch, patch // WORD)
+        rows, index = distinct_rows(cut.flatten(0, 2))
+        if 2 * len(rows) <= len(index):
+            cells = rows.view(torch.uint8).unflatten(1, (-1, patch**2))
+            return cells, index.view(cut.shape[:3]).flatten(1)
+    cut = _cut(image, patch, patch)
+    index = torch.arange(cut[..., 0].numel(), device=image.device)
+    cells = cut.flatten(0, 2).unflatten(1, (-1, patch**2))
+    return cells, index.view(cut.shape[:3]).flatten(1)
 
 
 def _cut(image: Tensor, height: int, width: int) -> Tensor:
     """Cut [N, C, H, W] into [N, h, w, C * height * width]."""
     cells = image.unflatten(-1, (-1, width)).unflatten(-3, (-1, height))
     return cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
-
-
-def _padded(image: Tensor, patch: int) -> Tensor:
-    below, right = (-size % patch for size in image.shape[-2:])
-    return F.pad(image, (0, right, 0, below)) if below or right else image
 
 
 class Windows(NamedTuple):
@@ -147,25 +127,21 @@ def distinct_windows(image: Tensor) -> Windows | None:
     A window of a tile of 8 pixels reaches into the last 3 pixels of the tile to the left, of the
     one above, or of both and the one between, so windows are told apart by a few numbers of tiles.
 
-    Args:
-        image: [N, C, H, W].
-
-    Returns:
-        The windows; None where that would not pay, for they are few or half of them differ, and
-        where sides are no multiples of 8.
+    Returns None where that would not pay, for they are few or half of them differ, and where sides
+    of the image [N, C, H, W] are no multiples of 8.
 
     >>> windows = distinct_windows(torch.zeros(64, 3, 48, 48, dtype=torch.uint8))
     >>> windows.pixels.shape, windows.where.shape
     (torch.Size([9, 3, 7, 7]), torch.Size([64, 12, 12]))
     """
-    rows, _, *size = image.shape
-    if any(side % WORD for side in size) or rows * size[0] * size[1] // 16 < FEWEST_WINDOWS:
+    height, width = (side // WORD for side in image.shape[-2:])
+    few = 4 * len(image) * height * width < FEWEST_WINDOWS
+    if few or not is_plain(image) or any(side % WORD for side in image.shape[-2:]):
         return None
-    found = _distinct_patches(image, WORD)
-    if found is None or len(found[0]) > MOST_TILES:
+    cells, where = cells_of.__wrapped__(image, WORD)  # type: ignore[attr-defined]
+    if 2 * len(cells) > where.numel() or len(cells) > MOST_TILES:
         return None
-    tiles, where = found[0].view(torch.int64), found[1]  # [U, C, 8], each number a row of pixels
-    height, width = (side // WORD for side in size)
+    tiles = cells.view(torch.int64)  # [U, C, 8], each number a row of pixels
     here = where.view(-1, height, width)
     strips = (tiles >> 40, tiles[..., 5:], tiles[..., 5:] >> 40)  # the last 3 columns, rows, both
     right, low, corner = (distinct_rows(strip.flatten(1))[1] + 1 for strip in strips)
@@ -202,35 +178,14 @@ def distinct_windows(image: Tensor) -> Windows | None:
     return Windows(pixels, row == 0, across == 0, index)
 
 
-def distinct_blocks(where: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Find the distinct blocks of 3 x 3 places that begin beside every second place, both ways.
-
-    Args:
-        where: what lies where, int64 [N, h, w].
-
-    Returns:
-        The blocks, int64 [U, 9], each what lies at its places plus 1, or 0 beyond the edge, and
-        which block lies where, int64 [N, (h + 1) // 2, (w + 1) // 2]; None where half of them
-        differ, so that this would not pay.
-
-    >>> blocks, which = distinct_blocks(torch.zeros(8, 4, 4, dtype=torch.int64))
-    >>> len(blocks), which.shape
-    (4, torch.Size([8, 2, 2]))
-    """
-    seen = F.pad(where + 1, (1, 1, 1, 1)).unfold(1, 3, 2).unfold(2, 3, 2).flatten(3)
-    blocks, index = distinct_rows(seen.flatten(0, 2))
-    if 2 * len(blocks) >= len(index):
-        return None
-    return blocks, index.view(seen.shape[:3])
-
-
 class Views(NamedTuple):
     """What the first of several strided convolutions look at, each distinct thing once."""
 
     windows: Windows
     """What the first two look at."""
     blocks: list[Tensor]
-    """What each that follows looks at, [U, 9], as :func:`distinct_blocks` returns it."""
+    """What each that follows looks at, [U, 9]: 3 x 3 places, each what lies there plus 1, or 0
+    beyond the edge."""
     where: Tensor
     """Which of the last of these lies where, int64 [N, h, w]."""
 
@@ -250,7 +205,11 @@ def distinct_views(image: Tensor, layers: int) -> Views | None:
     if windows is None:
         return None
     where, blocks = windows.where, list[Tensor]()
-    while len(blocks) < layers - 2 and (found := distinct_blocks(where)):
-        blocks.append(found[0])
-        where = found[1]
+    while len(blocks) < layers - 2:
+        seen = F.pad(where + 1, (1, 1, 1, 1)).unfold(1, 3, 2).unfold(2, 3, 2).flatten(3)
+        distinct, index = distinct_rows(seen.flatten(0, 2))
+        if 2 * len(distinct) >= len(index):
+            break
+        blocks.append(distinct)
+        where = index.view(seen.shape[:3])
     return Views(windows, blocks, where)

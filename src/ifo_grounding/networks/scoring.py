@@ -11,8 +11,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.networks.base import ImageNetwork, same_batch
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.layers import head
@@ -29,19 +27,14 @@ class PairScorer(ImageNetwork):
     """Base of the networks that score how images and an instruction go together, in two halves.
 
     Images are encoded without the instruction and instructions without the images, so that N
-    scenes against P instructions cost N + P encodings and N x P light scores.
-
-    Args:
-        shapes: sizes of inputs.
-        config: sizes of the network.
-        images: how many images are seen with one instruction.
+    scenes against P instructions cost N + P encodings and N x P light scores. ``images`` is how
+    many images are seen with one instruction.
     """
 
     prior: Tensor
-    """Added to every logit: what is known of suitability before anything is seen, see below."""
+    """Added to every logit: what is known of suitability before anything is seen."""
     mixed: Tensor
     """1 where logits were learned against pairs of which some were suitable, else 0."""
-
     head: nn.Module
     """Maps what :meth:`_read` returns to a logit."""
 
@@ -57,8 +50,7 @@ class PairScorer(ImageNetwork):
 
         A logit z is learned with positives as frequent as negatives. Against unsuitable pairs,
         Bayes' rule gives :math:`\log\frac{p}{1-p} = z + \log\frac{\pi}{1-\pi}`. Against a
-        mixture that holds the share :math:`\pi` of suitable ones, :math:`e^z` is how much more
-        frequent a pair is among positives than in the mixture, so that :math:`p = \pi e^z`
+        mixture that holds the share :math:`\pi` of suitable ones, :math:`p = \pi e^z`
         (Elkan and Noto 2008), at most 1. Beyond :data:`SUREST` scores keep their order.
 
         Args:
@@ -85,14 +77,8 @@ class PairScorer(ImageNetwork):
         scores = scores + self.prior
         return scores - self.mixed * torch.log1p(-scores.clamp(max=math.log(SUREST)).exp())
 
-    def flat_images(self, *pixels: Tensor) -> tuple[list[Tensor], torch.Size]:
-        """Return images, each [*B, C, H, W], as [N, C, H, W], and the B that they share."""
-        flat = [self.flat_pixels(image) for image in pixels]
-        same_batch(**{f"image {number}": batch for number, (_, batch) in enumerate(flat)})
-        return [image for image, _ in flat], flat[0][1]
-
     def encode_scenes(self, *pixels: Tensor) -> Any:
-        """Encode images, each [N, C, H, W], for :meth:`score_candidates`."""
+        """Encode images, each [*B, C, H, W], for :meth:`score_candidates`."""
         raise NotImplementedError
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
@@ -107,33 +93,27 @@ class PairScorer(ImageNetwork):
             words: encoded instructions [P, D], from :meth:`encode_instruction`.
             index: candidates of each scene, int64 [N, K].
 
-        Returns:
-            Logits, float32 [N, K].
+        Returns logits, float32 [N, K].
         """
         rows = max(1, PAIRS_AT_ONCE // max(index.shape[1], 1))
         with self.autocast(words):
             some = [slice(begin, begin + rows) for begin in range(0, max(len(index), 1), rows)]
-            parts = [
-                self.head(self._read(scenes[part], words, index[part])).squeeze(-1) for part in some
-            ]
-        return self._expected(torch.cat(parts))
+            read = [self.head(self._read(scenes[part], words, index[part])) for part in some]
+        return self._expected(torch.cat(read).squeeze(-1))
 
     def _read(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor:
         """Read N scenes in the light of some instructions [N, K]: [N, K, size]."""
         raise NotImplementedError
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Score images, each [*B, C, H, W], with token ids [*B, L], the last input."""
+        """Score images, each [*B, C, H, W], with token ids [*B, L], the last input: [*B, 1]."""
         *pixels, instruction = inputs
-        images, batch = self.flat_images(*pixels)
-        same_batch(images=batch, instruction=instruction.shape[:-1])
-        tokens = instruction.reshape(-1, instruction.shape[-1]).long()
-        if hidden_from_python(tokens):
-            which = torch.arange(len(tokens), device=tokens.device)
-        else:
-            tokens, which = distinct_rows(tokens)
-        scenes, words = self.encode_scenes(*images), self.encode_instruction(tokens)
-        return self.score_candidates(scenes, words, which.unsqueeze(1)).reshape(*batch, 1)
+        batch = instruction.shape[:-1]
+        images = {f"image {number}": image.shape[:-3] for number, image in enumerate(pixels)}
+        same_batch(**images, instruction=batch)
+        words = self.encode_instruction(instruction.reshape(-1, instruction.shape[-1]))
+        own = torch.arange(len(words), device=words.device).unsqueeze(1)
+        return self.score_candidates(self.encode_scenes(*pixels), words, own).reshape(*batch, 1)
 
 
 class GatedScorer(PairScorer):
@@ -145,8 +125,8 @@ class GatedScorer(PairScorer):
         self.head = head(self.trunk.size, config, 1)
 
     def encode_scenes(self, *pixels: Tensor) -> Tensor:
-        """Map images, each [N, C, H, W], to features [N, F, h, w]."""
-        images, _ = self.flat_images(*pixels)
+        """Map images, each [*B, C, H, W], to features [N, F, h, w]."""
+        images = [self.flat_pixels(image)[0] for image in pixels]
         with self.autocast(pixels[0]):
             features: Tensor = self.trunk.image(torch.cat(images, -3))
         return features

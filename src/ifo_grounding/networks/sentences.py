@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.networks.cells import look_up
 
 WORD_GAIN = 2.0
@@ -25,9 +24,8 @@ class GRUInstructionEncoder(nn.Module):
     in the middle of a long sentence. Padding, id 0 at the end, changes nothing; an instruction of
     padding alone is zeros.
 
-    On a CPU each distinct instruction of a batch is encoded once, and so is what several of them
-    begin or end with alike, which PyTorch's own GRU does not do: it takes twice as long. Elsewhere,
-    where finding what repeats would mean waiting for the device, PyTorch's GRU reads all of them.
+    On a CPU what several instructions of a batch begin or end with alike is encoded once. On a GPU,
+    which would have to be waited for to find it, PyTorch's GRU reads all of them.
 
     Initial recurrences are orthogonal (Saxe et al. 2014) and initial weights of words large:
     PyTorch's own, which are smaller, would make all sentences nearly the same.
@@ -71,14 +69,13 @@ class GRUInstructionEncoder(nn.Module):
         """Map token ids [*B, L] to features [*B, size], float32 inside ``torch.autocast`` too.
 
         Raises:
-            UserError: where an id lies outside the vocabulary; on a GPU, which would have to be
-                waited for, CUDA raises.
+            UserError: where an id lies outside the vocabulary; on a GPU, CUDA raises.
         """
         rows = tokens.reshape(-1, tokens.shape[-1]).long()
         with torch.autocast(tokens.device.type, enabled=False):  # too small to gain from bf16
             if not rows.numel():
                 encoded = self.embedding.weight.new_zeros(len(rows), self.size)
-            elif rows.is_cuda or hidden_from_python(rows):
+            elif rows.is_cuda:
                 encoded = self._encode_all(rows)
             else:
                 rows, which = distinct_rows(rows)
@@ -157,9 +154,9 @@ def word_tree(tokens: Tensor, lengths: Tensor) -> tuple[list[tuple[Tensor, Tenso
         lengths: how many of each row count, int64 [N].
 
     Returns:
-        For each word of a row the different beginnings that end with it, in order: their last word
-        and which of those one word shorter comes before it, int64 [B] each. And which of all
-        beginnings each row is, int64 [N], the empty one counted first.
+        For each length the different beginnings, in order: their last word and which of those one
+        word shorter comes before it, int64 [B] each. And which of all beginnings each row is, int64
+        [N], the empty one counted first.
 
     >>> tokens = torch.tensor([[5, 6, 7], [5, 6, 8], [5, 9, 0]])
     >>> steps, ends = word_tree(tokens, torch.tensor([3, 3, 2]))
@@ -196,11 +193,13 @@ def sentence_lengths(tokens: Tensor) -> Tensor:
 
 
 def without_padding(tokens: Tensor, words: int) -> Tensor:
-    """Cut [N, L], of at least one id, behind the end of the longest of its instructions.
+    """Cut [N, L] behind the end of the longest of its instructions.
 
     Raises:
         UserError: where an id is none of so many words.
     """
+    if not tokens.numel():
+        return tokens
     lowest, highest = tokens.aminmax()
     if lowest < 0 or highest >= words:
         raise UserError(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from tensordict.utils import NestedKey
-from torchrl.data import Bounded, Categorical, OneHot, Unbounded
+from torchrl.data import Bounded, Categorical, OneHot
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
@@ -60,7 +61,6 @@ n_actions=6, tile_size=None)
         source: Any,
         pixels: NestedKey = keys.PIXELS,
         instruction: NestedKey = keys.INSTRUCTION,
-        action: NestedKey = keys.ACTION,
     ) -> Shapes:
         """Read the sizes from ``source``.
 
@@ -68,9 +68,8 @@ n_actions=6, tile_size=None)
             source: a :class:`Shapes`, a TorchRL env, or anything with the attributes
                 ``image_shape`` and ``vocabulary_size`` (a dataset). Attributes named as the fields
                 of this class win over an env's specs.
-            pixels: where an env's spec describes images.
-            instruction: where an env's spec describes instructions.
-            action: where an env's spec describes actions; an env's only action has any name.
+            pixels: name of images in an env's spec.
+            instruction: name of instructions in an env's spec.
 
         Raises:
             UserError: where a size can be read from neither an attribute nor a spec, where actions
@@ -78,27 +77,20 @@ n_actions=6, tile_size=None)
         """
         if isinstance(source, cls):
             return source
-        observations = getattr(source, "observation_spec", None)
         found = {name: attribute(source, name) for name in cls.__dataclass_fields__}
-        if observations is not None:
-            for name, value in _from_specs(source, observations, pixels, instruction, action):
-                found[name] = value if found[name] is None else found[name]
+        for name, value in _from_specs(source, found, pixels, instruction):
+            found[name] = value if found[name] is None else found[name]
         for name, hint in (("image_shape", pixels), ("vocabulary_size", instruction)):
             if found[name] is None:
                 raise UserError(
                     f"cannot read {name} from {type(source).__name__}: pass an env with "
                     f"{hint!r} in its observation_spec, or a networks.Shapes"
                 )
-        found["image_shape"] = tuple(int(size) for size in found["image_shape"])
         return cls(**{name: value for name, value in found.items() if value is not None})
 
 
 def check_categorical(source: Any) -> None:
-    """Refuse an environment of one-hot actions, for policies here give their numbers.
-
-    Raises:
-        UserError: on one, as TorchRL's wrappers of Gymnasium are by default.
-    """
+    """Refuse an env of one-hot actions, as TorchRL makes of Gymnasium's: policies give numbers."""
     specs = getattr(source, "full_action_spec", None)
     if specs is not None and any(isinstance(spec, OneHot) for spec in specs.values(True, True)):
         raise UserError(
@@ -112,53 +104,53 @@ def patch_size(shapes: Shapes, config: NetworkConfig) -> int:
     return config.patch_size or shapes.tile_size or 8
 
 
+def grid_of(shapes: Shapes, config: NetworkConfig) -> tuple[int, int]:
+    """Return the height and width of the feature map of an image."""
+    _, height, width = shapes.image_shape
+    if config.preset == "strong":
+        patch = patch_size(shapes, config)
+        return -(-height // patch), -(-width // patch)
+    for _ in range(config.conv_layers):
+        height, width = (height + 1) // 2, (width + 1) // 2
+    return height, width
+
+
 def _from_specs(
-    env: Any, observations: Any, pixels: NestedKey, instruction: NestedKey, action: NestedKey
-) -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
+    env: Any, declared: dict[str, Any], pixels: NestedKey, instruction: NestedKey
+) -> Iterator[tuple[str, Any]]:
+    """Yield names and values of sizes that an env's specs say."""
+    observations = getattr(env, "observation_spec", None)
+    if observations is None:
+        return
     leaves = observations.keys(True, True)
+    batch: list[int] | None = None
     if pixels in leaves:
-        found.append(("image_shape", tuple(observations[pixels].shape[-3:])))
+        *batch, channels, height, width = observations[pixels].shape
+        yield "image_shape", (channels, height, width)
     if instruction in leaves:
         spec = observations[instruction]
-        found.append(("instruction_length", int(spec.shape[-1])))
-        found.append(("vocabulary_size", _count(spec)))
-    actions = getattr(env, "full_action_spec", None)
-    if actions is not None and attribute(env, "n_actions") is None:
-        names = list(actions.keys(True, True))
-        if action in names or len(names) == 1:
-            name = action if action in names else names[0]
-            batch = tuple(observations[pixels].shape[:-3]) if pixels in leaves else None
-            found.append(("n_actions", _count_actions(name, actions[name], batch)))
-    return found
-
-
-def _count_actions(name: NestedKey, spec: Any, batch: tuple[int, ...] | None) -> int:
-    """Return of how many actions an environment takes one at a time; ``batch`` is its images'."""
-    count: int | None = None
-    if isinstance(spec, (Categorical, OneHot)) and not hasattr(spec, "nvec"):
-        count = int(spec.space.n)
-    elif isinstance(spec, Bounded) and not spec.dtype.is_floating_point:
-        count = _count(spec) if bool((spec.space.low == 0).all()) else None
-    shape = tuple(spec.shape[:-1] if isinstance(spec, OneHot) else spec.shape)
-    if count is None or batch not in (None, shape):
-        raise UserError(
-            f"networks here choose one of a number of actions for each image, and {name!r} is "
-            f"{type(spec).__name__} of shape {list(spec.shape)}: make the environment with one "
-            "discrete action, 0 to n - 1"
-        )
-    return count
+        yield "instruction_length", int(spec.shape[-1])
+        yield "vocabulary_size", int(spec.nvec.max()) if hasattr(spec, "nvec") else _count(spec)
+    actions: Any = getattr(env, "full_action_spec", None)
+    names = [] if actions is None else list(actions.keys(True, True))
+    if declared["n_actions"] is None and (keys.ACTION in names or len(names) == 1):
+        name = keys.ACTION if keys.ACTION in names else names[0]
+        spec = actions[name]
+        count, shape = _count(spec), list(spec.shape)
+        one = shape[:-1] if isinstance(spec, OneHot) else shape
+        if count is None or batch not in (None, one):
+            raise UserError(
+                f"networks here choose one of a number of actions for each image, and {name!r} is "
+                f"{type(spec).__name__} of shape {shape}: make the environment with one "
+                "discrete action, 0 to n - 1"
+            )
+        yield "n_actions", count
 
 
 def _count(spec: Any) -> int | None:
-    """Return how many values a discrete or bounded integer spec allows, None if unbounded."""
-    if hasattr(spec, "nvec"):
-        return int(spec.nvec.max())
-    space = getattr(spec, "space", None)
-    n = getattr(space, "n", None)
-    if n is not None:
-        return int(n)
-    high = getattr(space, "high", None)
-    if high is None or spec.dtype.is_floating_point or isinstance(spec, Unbounded):
+    """Return how many numbers, from 0 on, a spec allows, None where it is of no such choice."""
+    if isinstance(spec, (Categorical, OneHot)) and not hasattr(spec, "nvec"):
+        return int(spec.space.n)
+    if not isinstance(spec, Bounded) or spec.dtype.is_floating_point or spec.space.low.any():
         return None
-    return int(high.max()) + 1
+    return int(spec.space.high.max()) + 1

@@ -1,4 +1,4 @@
-"""What policy, critic and reward model are made of."""
+"""Policy, critic and reward model: the preset's trunk, which reads image and words, and a head."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import math
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ifo_grounding.errors import UserError
 from ifo_grounding.networks.base import ImageNetwork, same_batch
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import ConvEncoder
 from ifo_grounding.networks.grounding import GroundedTrunk
 from ifo_grounding.networks.layers import GatedAttention, flatten_cells, head
 from ifo_grounding.networks.sentences import GRUInstructionEncoder
-from ifo_grounding.networks.shapes import Shapes
+from ifo_grounding.networks.shapes import Shapes, grid_of
 
 
 class GatedTrunk(nn.Module):
@@ -21,8 +22,8 @@ class GatedTrunk(nn.Module):
 
     def __init__(self, shapes: Shapes, config: NetworkConfig, images: int = 1) -> None:
         super().__init__()
-        channels, height, width = shapes.image_shape
-        self.image = ConvEncoder(images * channels, config.features, config.conv_layers)
+        channels = images * shapes.image_shape[0]
+        self.image = ConvEncoder(channels, config.features, config.conv_layers)
         self.instruction = GRUInstructionEncoder(
             shapes.vocabulary_size,
             config.embedding,
@@ -31,7 +32,7 @@ class GatedTrunk(nn.Module):
             config.sentence_pooling,
         )
         self.fusion = GatedAttention(self.instruction.size, config.features, config.sentence_rate)
-        self.size = config.features * math.prod(ConvEncoder.grid(height, width, config.conv_layers))
+        self.size = config.features * math.prod(grid_of(shapes, config))
 
     def fuse(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to fused features [N, F, h, w]."""
@@ -48,13 +49,7 @@ class GatedTrunk(nn.Module):
 
 
 class InstructedNetwork(ImageNetwork):
-    """The preset's trunk and a head: policy, critic, and what the reward model is made of.
-
-    Args:
-        shapes: sizes of inputs.
-        config: sizes of the network.
-        outputs: how many; by default a logit for each action.
-    """
+    """The preset's trunk and a head: policy, and critic with ``outputs=1``."""
 
     def __init__(self, shapes: Shapes, config: NetworkConfig, outputs: int | None = None) -> None:
         super().__init__(shapes, config)
@@ -69,3 +64,49 @@ class InstructedNetwork(ImageNetwork):
         with self.autocast(pixels):
             outputs = self.head(self.trunk(image, instruction.reshape(-1, instruction.shape[-1])))
         return outputs.float().reshape(*batch, outputs.shape[-1])
+
+
+class RewardNetwork(InstructedNetwork):
+    """rwd(s, t, a): one logit per action, of which the action at hand is read."""
+
+    def all_actions(self, pixels: Tensor, instruction: Tensor) -> Tensor:
+        """Score every action: logits, float32 [*B, A]."""
+        return super().forward(pixels, instruction)
+
+    def forward(self, pixels: Tensor, instruction: Tensor, action: Tensor) -> Tensor:  # type: ignore[override]
+        """Score the action, integer [*B], for the image and instruction: logits [*B, 1]."""
+        scores = self.all_actions(pixels, instruction)
+        same_batch(pixels=scores.shape[:-1], action=action.shape)
+        return scores.gather(-1, action.long().unsqueeze(-1))
+
+
+def instructed_network(policy: nn.Module) -> InstructedNetwork:
+    """Return the network within a policy that ``make_policy`` built."""
+    found = [part for part in policy.modules() if isinstance(part, InstructedNetwork)]
+    if len(found) != 1:
+        raise UserError("this must be a policy built by make_policy")
+    return found[0]
+
+
+def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Tensor:
+    """Return how each map of a policy weighs the cells of images: float32 [N, M, h, w], sums are 1.
+
+    The maps are the word maps of the preset ``strong``, each read as evidence for places and as
+    evidence against them, and of ``paper`` what all gates together let through.
+
+    Args:
+        policy: built by ``make_policy``.
+        pixels: uint8 [N, C, H, W].
+        instruction: token ids, int64 [N, L].
+
+    >>> import torch
+    >>> from ifo_grounding.networks import Shapes, make_policy
+    >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
+    >>> words = torch.ones(2, 16, dtype=torch.int64)
+    >>> attention_maps(policy, torch.zeros(2, 3, 48, 48), words).shape
+    torch.Size([2, 16, 6, 6])
+    """
+    network = instructed_network(policy)
+    image, _ = network.flat_pixels(pixels)
+    maps = network.trunk.maps(image, instruction).float()
+    return maps.unflatten(-1, network.grid)

@@ -8,32 +8,14 @@ from torch import Tensor, nn
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.grounding import MEANING, GroundedTrunk
 from ifo_grounding.networks.scoring import GatedScorer, PairScorer
-from ifo_grounding.networks.trunk import GatedTrunk, InstructedNetwork
+from ifo_grounding.networks.trunk import GatedTrunk, InstructedNetwork, instructed_network
 from ifo_grounding.networks.word_scoring import WordScorer
 
 Parts = list[tuple[nn.Module, nn.Module]]
 
 
-def instructed_network(policy: nn.Module) -> InstructedNetwork:
-    """Return the network within a policy that ``make_policy`` built.
-
-    >>> from ifo_grounding.networks import Shapes, make_policy
-    >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40))
-    >>> instructed_network(policy).trunk.size
-    312
-    """
-    found = [part for part in policy.modules() if isinstance(part, InstructedNetwork)]
-    if len(found) != 1:
-        raise UserError("this must be a policy built by make_policy")
-    return found[0]
-
-
 def start_trunk(network: InstructedNetwork, policy: nn.Module) -> None:
-    """Copy the weights of a policy's trunk to a critic or a reward model.
-
-    Raises:
-        UserError: where the weights do not fit.
-    """
+    """Copy the weights of a policy's trunk to a critic or a reward model."""
     source = instructed_network(policy)
     _copy(source, network, [(source.trunk, network.trunk)])
 
@@ -44,26 +26,20 @@ def start_scorer(network: PairScorer, policy: nn.Module, roles: bool = False) ->
     Of words that are read one by one that is what they look like and which side they name. Which
     of them count for which map is learned anew, unless ``roles`` says otherwise: a policy may hear
     object and target in one map, one after the other, which tells nobody whether both are there.
-
-    Raises:
-        UserError: where the weights do not fit.
     """
     source = instructed_network(policy)
     trunk = source.trunk
     parts: Parts = []
     widened: Parts = []
     if isinstance(trunk, GroundedTrunk) and isinstance(network, WordScorer):
-        parts = [(trunk.appearance, network.appearance)]
-        if roles:
-            parts += [(trunk.words, network.words)]
-        else:
-            words = trunk.words, network.words
-            parts += [(getattr(words[0], name), getattr(words[1], name)) for name in MEANING]
+        theirs, own = trunk.words, network.words
+        meaning = [(getattr(theirs, name), getattr(own, name)) for name in MEANING]
+        parts = [(trunk.appearance, network.appearance), *([(theirs, own)] if roles else meaning)]
         widened = [(trunk.attention, network.attention), (trunk.value, network.value)]
     elif isinstance(trunk, GatedTrunk) and isinstance(network, GatedScorer):
-        own = network.trunk
-        parts = [(trunk.instruction, own.instruction), (trunk.fusion, own.fusion)]
-        widened = [(trunk.image, own.image)]
+        gated = network.trunk
+        parts = [(trunk.instruction, gated.instruction), (trunk.fusion, gated.fusion)]
+        widened = [(trunk.image, gated.image)]
     _copy(source, network, parts, widened)
 
 
@@ -75,12 +51,11 @@ def _copy(
 ) -> None:
     """Copy the weights of each pair's first module to its second, which remembers them.
 
-    Args:
-        source: the network of the first modules.
-        network: that of the second.
-        parts: modules of the same kind and sizes.
-        widened: modules of which the second may read more images than one, whose inputs lie one
-            after the other: it reads the last one as the first module does, the others not yet.
+    Of ``widened`` the second may read several images, whose inputs lie one after the other: it
+    reads the last one as the first module does, the others not yet.
+
+    Raises:
+        UserError: where the weights do not fit.
     """
     try:
         if source.config.preset != network.config.preset:

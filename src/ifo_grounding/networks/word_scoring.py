@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.modules import hidden_from_python
 from ifo_grounding.networks.appearance import ColourAndForm
 from ifo_grounding.networks.cells import Kinds, cell_places, group_cells, look_up
 from ifo_grounding.networks.config import NetworkConfig
@@ -40,17 +39,12 @@ class WordScorer(PairScorer):
     A cell's features are what every word of the vocabulary says of it, for each image, and what
     silent heads see in all images; an instruction's are how much every word counts for each map.
     Their product are the maps, which tell places, as in
-    :class:`~ifo_grounding.networks.GroundedTrunk`, what lies around these places, whether there is
-    one of them, and how many cells fit.
+    :class:`~ifo_grounding.networks.GroundedTrunk`, what lies around them, whether there is one, and
+    how many cells fit.
 
-    A policy asks where the evidence for a word is greatest; a classifier, whether it is enough.
-    What is enough differs from word to word, so that each has a threshold of its own. It shifts
-    what is said of all cells alike, which leaves the places as they are and moves the counts.
-
-    Args:
-        shapes: sizes of inputs.
-        config: sizes of the network.
-        images: how many images are seen with one instruction, their cells side by side.
+    A policy asks where the evidence for a word is greatest; a classifier, whether it is enough. So
+    each word has a threshold, which shifts what is said of all cells alike: places stay as they
+    are, counts do not.
     """
 
     place: Tensor
@@ -87,29 +81,14 @@ class WordScorer(PairScorer):
             tables.append(Seen(colour + form + self.threshold, silent, forms, cells.where))
         return tables
 
-    def _seen(self, tables: list[Seen], cells: list[Tensor]) -> Tensor:
-        """Look up what is seen of some cells of each image, int64 [N, C]: [N, C, F - AROUND]."""
-        both = list(zip(tables, cells, strict=True))
-        said = [look_up(table.said, own) for table, own in both]
-        silent = sum(look_up(table.silent, own) for table, own in both)
-        return torch.cat([*said, silent + torch.cat([self.attention.bias, self.value.bias])], -1)
-
-    def _surroundings(self, tables: list[Seen]) -> Tensor:
-        """Return what lies around each cell, [N, h * w, AROUND]."""
-        forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
-        return F.relu(surroundings(self.around, F.relu(forms), self.grid))
-
     def encode_scenes(self, *pixels: Tensor) -> Kinds:
-        """Encode images, each [N, C, H, W], those of their cells that look alike once."""
-        images, _ = self.flat_images(*pixels)
+        """Encode images, each [*B, C, H, W], those of their cells that look alike once."""
+        images = [self.flat_pixels(image)[0] for image in pixels]
         with self.autocast(pixels[0]):
             tables = self._tables(images)
-            around = self._surroundings(tables)
+            forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
+            around = F.relu(surroundings(self.around, F.relu(forms), self.grid))
             place = self.place.to(around.dtype).expand(len(around), -1, -1)
-            if hidden_from_python(pixels[0]):  # every cell for itself
-                seen = self._seen(tables, [table.where for table in tables])
-                ones = around.new_ones(around.shape[:2])
-                return Kinds(torch.cat([seen, around], -1).transpose(1, 2), place, ones)
             index = tables[0].where
             for table in tables[1:]:
                 index = index * len(table.said) + table.where
@@ -118,20 +97,20 @@ class WordScorer(PairScorer):
             for table in reversed(tables):
                 cells.insert(0, kind % len(table.said))
                 kind = kind // len(table.said)
-            features = torch.cat([self._seen(tables, cells), mean[..., 2:]], -1)
+            both = list(zip(tables, cells, strict=True))
+            said = [look_up(table.said, own) for table, own in both]
+            silent = sum(look_up(table.silent, own) for table, own in both)
+            silent = silent + torch.cat([self.attention.bias, self.value.bias])
+            features = torch.cat([*said, silent, mean[..., 2:]], -1)
         return Kinds(features.transpose(1, 2), mean[..., :2], number)
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
         """Map token ids [*B, L] to how much each word counts, and the modifier: [*B, D]."""
-        tokens = instruction.reshape(-1, instruction.shape[-1]).long()
-        which = None
-        if tokens.numel() and not hidden_from_python(tokens):
-            tokens, which = distinct_rows(tokens)
-            tokens = without_padding(tokens, self.known)
+        tokens, which = distinct_rows(instruction.reshape(-1, instruction.shape[-1]).long())
+        tokens = without_padding(tokens, self.known)
         with torch.autocast(tokens.device.type, enabled=False):
             spoken, modifier = self.words.listen(tokens)
-            words = torch.cat([spoken.flatten(1), modifier], -1)
-        words = words if which is None else look_up(words, which)
+            words = look_up(torch.cat([spoken.flatten(1), modifier], -1), which)
         return words.reshape(*instruction.shape[:-1], words.shape[-1])
 
     def _read(self, scenes: Kinds, words: Tensor, index: Tensor) -> Tensor:
@@ -165,11 +144,11 @@ class WordScorer(PairScorer):
         return torch.cat(parts, -1)
 
     def _pointed(self, cells: Tensor, spoken: Tensor, index: Tensor) -> Tensor:
-        """Return the maps' logits of cells [N, F, C] for instructions: [N, C, K, images * maps].
+        """Return the maps' logits of cells for instructions: [N, C, K, images * maps].
 
         Args:
-            cells: features of N scenes.
-            spoken: how much each word counts for each map, of a pool of instructions [P, V * maps].
+            cells: features of N scenes, [N, F, C].
+            spoken: how much each word counts for each map, of P instructions, [P, V * maps].
             index: which of these each scene is read with, [N, K].
         """
         maps = self.config.maps

@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import has_word_penalty, hidden_from_python, output_key
+from ifo_grounding.modules import has_word_penalty, output_key
 
 
 @dataclass
@@ -113,17 +113,21 @@ def flat(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
 def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = None) -> None:
     """Raise :class:`UserError` unless ``action`` has this shape and is one of ``count``, if given.
 
+<<<<<<< HEAD
     Numbers are not checked on a GPU, which would have to be waited for, and inside the compiler.
+=======
+    Where ``count`` actions are known, indices have to be of them. On a GPU, which would have to be
+    waited for, they are not checked.
+>>>>>>> cut-networks
     """
     if tuple(action.shape) != tuple(expected):
         raise UserError(
             f"actions must have shape {list(expected)}, got {list(action.shape)}: indices have no "
             "trailing dim, and one-hot actions fit a one-hot policy alone"
         )
-    seen = action.device.type == "cpu" and not hidden_from_python(action)
     if count is not None and action.is_floating_point():
         raise UserError(f"actions are whole numbers 0..{count - 1}, got {action.dtype}")
-    if count is None or not seen or not action.numel():
+    if count is None or action.is_cuda or not action.numel():
         return
     for number in map(int, action.aminmax()):
         if not 0 <= number < count:

@@ -21,9 +21,8 @@ class ImitationLoss(SupervisedLoss):
     takes integer actions for logits.
 
     Of a network with :class:`~ifo_grounding.networks.WordMaps`, which reads word by word, it also
-    writes ``loss_words``, which regularises what words say about colours and about form: a word
-    that needs but one of the two keeps to it. Its weight grows with the likelihood of the actions.
-    Train such a network eagerly: inside ``torch.compile`` there is no penalty.
+    writes ``loss_words``, which regularises what words say about colours and about form; its weight
+    grows with the likelihood of the actions. A word that needs but one of the two then keeps to it.
 
     Args:
         network: a policy with ``get_dist``, such as ``make_policy`` or TorchRL's
