@@ -12,7 +12,7 @@ from envs.dial import MARKS, PRESS, Dial
 from ifo_grounding.data import collect_transitions
 from ifo_grounding.envs import from_gymnasium
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation import record_episodes, return_correlation, success_rate
+from ifo_grounding.evaluation import record_episodes, return_audit, success_rate
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
 from ifo_grounding.transforms import GoalReward, InstructionSampler
 
@@ -163,7 +163,7 @@ def test_episodes_are_recorded_and_audited_as_they_are_counted():
 
     model = TensorDictModule(at_the_mark, ["pixels", "instruction"], ["goal_score"])
     reward = GoalReward(model, stop_action=PRESS)
-    audit = return_correlation(half, reward, dials(7), episodes=14, mode="greedy")
+    audit = return_audit(half, reward, dials(7), episodes=14, mode="greedy")
     assert torch.equal(audit.outcomes, result.outcomes) and audit.auc.value == 1.0
 
 

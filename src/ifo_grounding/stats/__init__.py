@@ -4,7 +4,7 @@ Numbers go in and out as numpy arrays or anything that becomes one. Everything t
 function of its ``seed``.
 """
 
-from ifo_grounding.stats.association import auc, correlation
+from ifo_grounding.stats.association import auc
 from ifo_grounding.stats.rates import (
     holm,
     paired_difference,
@@ -20,7 +20,6 @@ __all__ = [
     "Estimate",
     "Rate",
     "auc",
-    "correlation",
     "holm",
     "paired_difference",
     "reliability",
