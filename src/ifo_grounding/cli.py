@@ -56,15 +56,6 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
     The options are composed from ``conf/config.yaml`` and ``name=value`` on the command line, and
     checked; a recipe with a ``conf/<script name>.yaml`` has options of its own. What is wrong with
     them, and a :class:`UserError` of the recipe itself, becomes one line on stderr and exit code 2.
-
-    Example of a whole recipe ``recipes/greet.py``::
-
-        @recipe_main
-        def main(options):
-            print("hello", options.task)
-
-        if __name__ == "__main__":
-            main()
     """
     script = Path(inspect.getfile(function)).resolve()
 

@@ -115,9 +115,8 @@ def _demonstrations(cfg: DictConfig) -> int:
     folder = Path(cfg.recorded)
     if not folder.is_dir():
         raise UserError(f"recorded={folder} is no folder of demonstrations")
-    return min(
-        asked, len(read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder))
-    )
+    recorded = read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder)
+    return min(asked, len(recorded))
 
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Sequence[str]) -> DictConfig:

@@ -17,8 +17,8 @@ from ifo_grounding.data import Demonstrations, Truth
 from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.evaluation.labels import actions_of
-from ifo_grounding.evaluation.scenes import Player, device_of, play_scenes
-from ifo_grounding.modules import evaluating
+from ifo_grounding.evaluation.scenes import Player, play_scenes
+from ifo_grounding.modules import device_of, evaluating
 from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Described, Estimate, Rate, auc, wilson
 from ifo_grounding.transforms import GoalReward, LearnedReward
@@ -97,7 +97,8 @@ def _score_actions(
     n_actions: int,
 ) -> Tensor:
     """Logits of every action in every transition, float32 [N, A]."""
-    device, instructions, scores = device_of(reward_model), demos.instructions, []
+    device = device_of(reward_model) or torch.device("cpu")
+    instructions, scores = demos.instructions, []
     with evaluating(reward_model):
         for part in torch.arange(len(frame)).split(max(1, AT_ONCE // n_actions)):
             seen = {

@@ -117,10 +117,7 @@ def compare_success(before: SuccessResult, after: SuccessResult) -> Difference:
         UserError: where the scenes or the modes differ.
     """
     if before.scenes != after.scenes or len(before.outcomes) != len(after.outcomes):
-        raise UserError(
-            f"the results are about different scenes ({len(before.outcomes)}, {before.scenes}; "
-            f"{len(after.outcomes)}, {after.scenes}): use the same seed, stream and options"
-        )
+        raise UserError("the two are about different scenes: use the same seed, stream and options")
     if before.mode != after.mode:
         raise UserError(f"cannot compare a {before.mode} with a {after.mode} policy")
     return paired_difference(before.outcomes.numpy(), after.outcomes.numpy())

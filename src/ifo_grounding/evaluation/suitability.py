@@ -12,7 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, whole
-from ifo_grounding.evaluation.scenes import MAX_STEPS, device_of
+from ifo_grounding.evaluation.scenes import MAX_STEPS
+from ifo_grounding.modules import device_of
 from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Described, Estimate, Rate, auc, reliability, wilson
 from ifo_grounding.tasks.goals import REASONS, Goal, verdict
@@ -117,7 +118,7 @@ def suitable_rate(
     if whole("pairs_per_state", pairs_per_state) < 0:
         raise UserError(f"pairs_per_state must not be negative, got {pairs_per_state}")
     states, batch_size = at_least_one("states", states), at_least_one("batch_size", batch_size)
-    device = device_of(classifier)
+    device = device_of(classifier) or torch.device("cpu")
     tokens, of_pool = read_pool(task, pool)
     goals = of_pool.to(device)
     scorer = PoolScorer(classifier, tokens.to(device))

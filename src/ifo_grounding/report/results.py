@@ -29,10 +29,8 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
             out.
 
     >>> from ifo_grounding.stats import wilson
-    >>> rows = results_rows({"labels": {"rate": wilson(9, 10).as_dict(), "worst": "P",
-    ...     "per_action": {"P": wilson(1, 2).as_dict()}}})
-    >>> [row["measured"] for row in rows]
-    ['inverse accuracy', 'inverse accuracy, worst action (P)']
+    >>> results_rows({"suitability": {"served": wilson(9, 10).as_dict()}})[0]["measured"]
+    'states served'
     """
     return [
         {"measured": measured, "result [95% interval]": restored(kind, values)}

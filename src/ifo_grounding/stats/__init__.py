@@ -1,8 +1,4 @@
-"""Rates, differences and areas under the ROC curve, each with its 95% interval.
-
-Numbers go in and out as numpy arrays or anything that becomes one. Everything that resamples is a
-function of its ``seed``.
-"""
+"""Rates, differences and areas under the ROC curve, each with its 95% interval."""
 
 from ifo_grounding.stats.association import auc
 from ifo_grounding.stats.rates import (
