@@ -45,7 +45,6 @@ def frames_of(gif):
 
 
 def near(pixel, colour):
-    """Whether a pixel has a colour, up to the palette."""
     wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     return np.abs(pixel - wanted).max() < 12
 

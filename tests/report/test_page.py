@@ -41,7 +41,6 @@ class Outline(HTMLParser):
 
 
 def read(page):
-    """Parse a page and check that its tags match."""
     outline = Outline()
     outline.feed(page.read_text())
     assert outline.open == []
