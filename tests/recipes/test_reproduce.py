@@ -10,7 +10,7 @@ from ifo_grounding.options import options_of, options_of_jobs
 
 TINY = (
     *("all.budget=tiny", "+all.networks.features=16", "+all.transitions.n=500"),
-    *("all.evaluate={episodes:20,audit_episodes:10,mode:greedy}", "progress=false"),
+    *("all.evaluate.episodes=20", "+all.evaluate.audit_episodes=10", "progress=false"),
     *("+all.imitate.trials=1", "+all.instruction.trials=1", "+all.self_examine.num_envs=8"),
     *("+all.self_examine.select_episodes=8", "+all.self_examine.steps=10"),
     *("preset.strong.inverse.steps=20", "preset.strong.imitate.steps=20"),
