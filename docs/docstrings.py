@@ -1,14 +1,11 @@
 """Docstrings for the API pages: examples become sections, roles plain code, maths maths."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
 import griffe
 
 ROLE = re.compile(r":(?:class|func|meth|mod|data|attr):`~?([\w.]+)`")
-
 MATH = re.compile(r"^\.\. math:: (.+)$", re.MULTILINE)
 
 

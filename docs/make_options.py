@@ -6,8 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from ifo_grounding.config import Options
-from ifo_grounding.files import atomic_write
-from ifo_grounding.options import field_docs, options_of
+from ifo_grounding.options import field_docs, options_of, written
 from ifo_grounding.training import FitConfig
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
@@ -50,11 +49,9 @@ def table(kind: type, names: list[str], above: str, **columns: list) -> str:
 
 
 def shown(values: list, name: str) -> str:
-    texts = dict.fromkeys(str(getattr(each, name)) for each in values)
-    words = {"None": "null", "True": "true", "False": "false"}
-    return " / ".join(f"`{words.get(text, text)}`" for text in texts)
+    texts = dict.fromkeys(written(getattr(each, name)) for each in values)
+    return " / ".join(f"`{text}`" for text in texts)
 
 
 if __name__ == "__main__":
-    with atomic_write(PAGE) as temporary:
-        temporary.write_text(page())
+    PAGE.write_text(page())

@@ -1,14 +1,11 @@
-"""Write the tables of results: ``python docs/make_results.py`` after ``results/`` has changed.
-
-Reads ``results/study`` and ``results/babyai``; a test checks that the pages are up to date.
-"""
+"""Write the tables of results: ``python docs/make_results.py`` after ``results/`` has changed."""
 
 from collections.abc import Sequence
 from functools import cache
 from statistics import median
 
 from make_tables import TABLE_2, pieces
-from pages import NOT_RUN, Row, Runs, chosen, difference, gain, rate, read, success, write
+from pages import NOT_RUN, Row, Runs, chosen, difference, gain, ran, rate, read, success, write
 
 from ifo_grounding.report import figure_png, markdown_table, rates_by_number
 from ifo_grounding.report.results import brief
@@ -16,12 +13,8 @@ from ifo_grounding.stats import Rate, holm
 from ifo_grounding.tasks import TASKS
 
 LEVELS = ("GoToObj", "GoToLocal", "PickupLoc")
-POLICIES = {
-    "bot": "demonstrator",
-    "true actions": "true_actions",
-    "phase 1": "phase1",
-    "phase 2": "phase2",
-}
+PHASES = {"phase 1": "phase1", "phase 2": "phase2"}
+POLICIES = {"bot": "demonstrator", "true actions": "true_actions", **PHASES}
 
 
 @cache
@@ -32,13 +25,9 @@ def runs_of(folder: str, order: Sequence[str]) -> dict[tuple[str, int], Runs]:
     return dict(sorted(plain.items(), key=lambda item: (order.index(item[0][0]), item[0][1])))
 
 
-def studies() -> dict[tuple[str, int], Runs]:
-    return runs_of("study", TASKS)
-
-
 def study_rows() -> dict[tuple[str, int], Row]:
     """Return a row for each study; p is corrected for the tasks with as many demonstrations."""
-    found = studies()
+    found = runs_of("study", TASKS)
     p: dict[tuple[str, int], float] = {}
     for number in {number for _, number in found}:
         same = [key for key in found if key[1] == number]
@@ -66,23 +55,25 @@ def over_continued(runs: Runs) -> str:
 def choice_rows(number: int) -> list[Row]:
     """Return what the instruction classifier chose with some number of demonstrations."""
     names = {"suitable": "rate", "states served": "served", "states that can be": "servable"}
-    return [
-        {"task": task, **{title: chosen(runs, name) for title, name in names.items()}}
-        for (task, n), runs in studies().items()
-        if n == number
-    ]
+    found = {task: runs for (task, n), runs in runs_of("study", TASKS).items() if n == number}
+    return [{"task": t, **{n: chosen(r, names[n]) for n in names}} for t, r in found.items()]
+
+
+def curves(found: dict[tuple[str, int], Runs], policies: dict[str, str]) -> dict:
+    """Return the rates of policies by title, policy and number of demonstrations."""
+    panels: dict[str, dict[str, dict[int, Rate]]] = {}
+    for (title, number), runs in found.items():
+        for label, name in policies.items():
+            if ran(runs, name):
+                panels.setdefault(title, {}).setdefault(label, {})[number] = rate(runs, name)
+    return panels
 
 
 def efficiency_picture() -> bytes:
     """Draw what `strong` reaches on each task by number of demonstrations, and the paper's best."""
-    known = {**studies(), **{(t, 80_000): pieces()[t, "strong", "pairs-5000"] for t in TASKS}}
-    panels: dict[str, dict[str, dict[int, Rate]]] = {}
-    for task in TASKS:
-        numbers = sorted(number for of, number in known if of == task)
-        panels[task] = {
-            f"phase {i}": {n: rate(known[task, n], f"phase{i}") for n in numbers} for i in (1, 2)
-        }
+    most = {(task, 80_000): pieces()[task, "strong", "pairs-5000"] for task in TASKS}
     best = {task: {"paper, 80,000": max(TABLE_2[task]) / 100} for task in TASKS}
+    panels = curves(runs_of("study", TASKS) | most, PHASES)
     return figure_png(rates_by_number(panels, references=best))
 
 
@@ -90,26 +81,16 @@ def babyai_rows() -> list[Row]:
     rows = []
     for (level, number), runs in runs_of("babyai", LEVELS).items():
         row = {"level": level, "demonstrations": f"{number:,}", "seeds": len(runs)}
-        for title, name in POLICIES.items():
-            ran = all(name in run["results"] for run in runs)
-            row[title] = success(runs if ran else None, name)
-        rows.append({**row, "gain, points": gain(runs), "minutes": round(median(minutes(runs)))})
+        row |= {title: success(runs, name) for title, name in POLICIES.items()}
+        rows.append({**row, "gain, points": gain(runs), "minutes": minutes(runs)})
     return rows
 
 
-def minutes(runs: Runs) -> list[float]:
+def minutes(runs: Runs) -> int:
     """Return how long the method and its evaluation took, without the references."""
     aside = ("imitate_truth", "evaluate_references")
-    return [(r["seconds"] - sum(r["stages"].get(stage, 0.0) for stage in aside)) / 60 for r in runs]
-
-
-def babyai_picture() -> bytes:
-    panels: dict[str, dict[str, dict[int, Rate]]] = {level: {} for level in LEVELS}
-    for (level, number), runs in runs_of("babyai", LEVELS).items():
-        for title, name in POLICIES.items():
-            if all(name in run["results"] for run in runs):
-                panels[level].setdefault(title, {})[number] = rate(runs, name)
-    return figure_png(rates_by_number(panels))
+    seconds = [r["seconds"] - sum(r["stages"].get(stage, 0.0) for stage in aside) for r in runs]
+    return round(median(seconds) / 60)
 
 
 def tables() -> dict[str, str]:
@@ -126,4 +107,5 @@ def tables() -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    write(tables(), {"efficiency.png": efficiency_picture(), "babyai.png": babyai_picture()})
+    babyai = figure_png(rates_by_number(curves(runs_of("babyai", LEVELS), POLICIES)))
+    write(tables(), {"efficiency.png": efficiency_picture(), "babyai.png": babyai})

@@ -1,7 +1,4 @@
-"""Write the table of speeds: ``python docs/make_speed.py`` after ``make bench``.
-
-Reads ``results/bench``; a test checks that the page is up to date.
-"""
+"""Write the table of speeds: ``python docs/make_speed.py`` after ``make bench``."""
 
 from typing import Any
 
@@ -18,14 +15,11 @@ ORDER = (
     *("whole", "growth"),
 )
 """Of the rows in the tables; others come last."""
-SEVEN = 7
-"""Rows of a table at most."""
 
 
 def measured(device: str) -> dict[str, dict[str, Any]]:
     """Return the rows that were measured on a device."""
-    path = RESULTS / "bench" / f"{device}.json"
-    found = read_json(path)["rows"] if path.exists() else {}
+    found = read_json(RESULTS / "bench" / f"{device}.json")["rows"]
     return dict(sorted(found.items(), key=lambda item: ([*ORDER, item[0]].index(item[0]), item[0])))
 
 
@@ -75,23 +69,20 @@ def on_device(rows: dict[str, dict[str, Any]]) -> str:
     parts = [f"{machine}, commits {', '.join(commits)}." for machine, commits in made.items()]
     rates = [rate_row(row) for row in rows.values() if row["rates"]]
     facts = [fact_row(row) for row in rows.values() if row["facts"]]
-    parts += [markdown_table(part) for part in (rates[:SEVEN], rates[SEVEN:], facts) if part]
+    parts += [markdown_table(part) for part in (rates[:7], rates[7:], facts) if part]
     notes = [f"- {row['name']}: {row['note']}." for row in rows.values() if row["note"]]
     return "\n\n".join([*parts, "\n".join(notes)])
 
 
 def draw_growth() -> None:
     """Draw how long things take by their size, and a line along which cost grows as size does."""
-    curves = measured("cpu").get("growth", {}).get("curves")
-    if not curves:
-        return
+    curves = measured("cpu")["growth"]["curves"]
     figure = Figure(figsize=(9.6, 3.2), layout="constrained")
     for axes, (name, curve) in zip(figure.subplots(1, len(curves)), curves.items(), strict=True):
         sizes = sorted(map(int, curve))
         seconds = [curve[str(size)] for size in sizes]
-        linear = [seconds[-1] * size / sizes[-1] for size in sizes]
-        axes.loglog(sizes, linear, color="#9aa0a6", linestyle="--", label="linear")
-        axes.loglog(sizes, seconds, color="#2f5fd0", marker="o", markersize=4, label="measured")
+        axes.loglog(sizes, [seconds[-1] * size / sizes[-1] for size in sizes], "--", label="linear")
+        axes.loglog(sizes, seconds, marker="o", markersize=4, label="measured")
         axes.set_title(name, fontsize=9, loc="left")
         axes.set_ylabel("seconds")
         axes.legend(frameon=False, fontsize=8)
@@ -102,7 +93,7 @@ def tables() -> dict[str, str]:
     """Return the tables of two cores, for which speeds are asked, and of a GPU."""
     there = {name: {**row, "reach": {}} for name, row in measured("cuda").items()}
     found = {"speed": measured("cpu"), "speed-gpu": there}
-    return {name: on_device(rows) if rows else "Not run." for name, rows in found.items()}
+    return {name: on_device(rows) for name, rows in found.items()}
 
 
 if __name__ == "__main__":

@@ -1,7 +1,4 @@
-"""Write the paper's tables and figures with the numbers of here: ``python docs/make_tables.py``.
-
-Reads ``results/tables``; a test checks that the pages are up to date.
-"""
+"""Write the paper's tables and figures with the numbers of here: ``python docs/make_tables.py``."""
 
 import math
 from collections.abc import Callable
@@ -56,73 +53,52 @@ def gain_of_paper(before: Rate, after: Rate) -> str:
     return f"{100 * points:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
 
 
-def table_2() -> list[Row]:
-    found, rows = pieces(), []
-    for task in TASKS:
-        first, *later = TABLE_2[task]
-        row = {"task": task, "the paper, 1": brief(of_paper(first))}
-        row["the paper, best 2"] = brief(of_paper(max(later)))
-        for preset in PRESETS:
-            runs = found.get((task, preset, "pairs-5000"))
-            row |= {f"`{preset}`, {i}": success(runs, f"phase{i}") for i in (1, 2)}
-        rows.append(row)
-    return rows
+def table_2(task: str) -> Row:
+    first, *later = TABLE_2[task]
+    row = {"the paper, 1": brief(of_paper(first)), "the paper, best 2": brief(of_paper(max(later)))}
+    for preset in PRESETS:
+        runs = pieces().get((task, preset, "pairs-5000"))
+        row |= {f"`{preset}`, {i}": success(runs, f"phase{i}") for i in (1, 2)}
+    return row
 
 
-def gain_rows() -> list[Row]:
-    found, rows = pieces(), []
-    for task in TASKS:
-        row = {"task": task}
-        first, *later = map(of_paper, TABLE_2[task])
-        for pairs, told in zip((5000, 10_000), later, strict=True):
-            row[f"the paper, {pairs:,} pairs"] = gain_of_paper(first, told)
-            row[f"`paper`, {pairs:,} pairs"] = gain(found.get((task, "paper", f"pairs-{pairs}")))
-        row["paid for goals"] = gain(found.get((task, "paper", "goal-pairs-5000")))
-        control = found.get((task, "paper", "goal-continued"))
-        row["imitation continued"] = (
-            brief(difference(control, "phase1", "continued")) if control else NOT_RUN
-        )
-        rows.append(row)
-    return rows
+def gains(task: str) -> Row:
+    found, row = pieces(), {}
+    first, *later = map(of_paper, TABLE_2[task])
+    for pairs, told in zip((5000, 10_000), later, strict=True):
+        row[f"the paper, {pairs:,} pairs"] = gain_of_paper(first, told)
+        row[f"`paper`, {pairs:,} pairs"] = gain(found.get((task, "paper", f"pairs-{pairs}")))
+    row["paid for goals"] = gain(found.get((task, "paper", "goal-pairs-5000")))
+    control = found.get((task, "paper", "goal-continued"))
+    compared = brief(difference(control, "phase1", "continued")) if control else NOT_RUN
+    return {**row, "imitation continued": compared}
 
 
-def table_3() -> list[Row]:
-    found, rows = pieces(), []
-    for task in TASKS:
-        row = {"task": task, "the paper": f"{TABLE_3[task]:.1f}%"}
-        for preset in PRESETS:
-            runs = found[task, preset, "phase-1"]
-            shares = [run["results"]["suitability"]["rate"]["rate"] for run in runs]
-            between = f"{100 * min(shares):.1f}, {100 * max(shares):.1f}"
-            row[f"`{preset}`"] = f"{percent(shares)} [{between}]"
-            row[f"`{preset}`, served"] = chosen(runs, "served")
-        rows.append({**row, "can be served": chosen(runs, "servable")})
-    return rows
+def table_3(task: str) -> Row:
+    row = {"the paper": f"{TABLE_3[task]:.1f}%"}
+    for preset in PRESETS:
+        runs = pieces()[task, preset, "phase-1"]
+        shares = [run["results"]["suitability"]["rate"]["rate"] for run in runs]
+        between = f"{100 * min(shares):.1f}, {100 * max(shares):.1f}"
+        row[f"`{preset}`"] = f"{percent(shares)} [{between}]"
+        row[f"`{preset}`, served"] = chosen(runs, "served")
+    return {**row, "can be served": chosen(runs, "servable")}
 
 
-def zero_shot() -> list[Row]:
+def zero_shot(task: str) -> Row:
     """Return Table 4: success after phase 1 on pairs held out from instructions, and on others."""
-    found, rows = pieces(), []
-    for task in TASKS:
-        row = {"task": task, "the paper, 1 / 2": "{}% / {}%".format(*TABLE_4[task])}
-        for preset in PRESETS:
-            runs = found[task, preset, "zero-shot"]
-            both = f"{success(runs, 'phase1')} / {percent(map(of_trained, runs))}"
-            row[f"`{preset}`, new / other pairs"] = both
-        unseen = found[task, "strong", "zero-shot-unseen"]
-        rows.append({**row, "`strong`, new pairs never seen": success(unseen, "phase1")})
-    return rows
+    row = {"the paper, 1 / 2": "{}% / {}%".format(*TABLE_4[task])}
+    for preset in PRESETS:
+        runs = pieces()[task, preset, "zero-shot"]
+        both = f"{success(runs, 'phase1')} / {percent(map(of_trained, runs))}"
+        row[f"`{preset}`, new / other pairs"] = both
+    unseen = pieces()[task, "strong", "zero-shot-unseen"]
+    return {**row, "`strong`, new pairs never seen": success(unseen, "phase1")}
 
 
-def zero_shot_gains() -> list[Row]:
+def zero_shot_gains(task: str) -> Row:
     """Return what phase 2 gains on held-out pairs."""
-    found = pieces()
-    names = [(f"`{preset}`", preset) for preset in PRESETS]
-    last = "zero-shot-pairs-5000"
-    return [
-        {"task": task, **{title: gain(found[task, preset, last]) for title, preset in names}}
-        for task in TASKS
-    ]
+    return {f"`{name}`": gain(pieces()[task, name, "zero-shot-pairs-5000"]) for name in PRESETS}
 
 
 def of_trained(run: dict[str, Any]) -> float:
@@ -132,9 +108,8 @@ def of_trained(run: dict[str, Any]) -> float:
 
 
 def counts(phase: str, preset: str, cells: Callable[[Runs], Row]) -> list[Row]:
-    found = pieces()
-    runs = {task: found.get((task, preset, phase)) for task in TASKS}
-    return [{"task": task, "seeds": len(of), **cells(of)} for task, of in runs.items() if of]
+    found = {task: pieces().get((task, preset, phase)) for task in TASKS}
+    return [{"task": task, "seeds": len(of), **cells(of)} for task, of in found.items() if of]
 
 
 def wrong_choices(runs: Runs) -> Row:
@@ -156,12 +131,15 @@ def changes(runs: Runs) -> Row:
 
 def tables() -> dict[str, str]:
     """Return every table by name."""
-    found: dict[str, list[Row]] = {
-        "paper": table_2(),
-        "gains": gain_rows(),
-        "table-3": table_3(),
-        "zero-shot": zero_shot(),
-        "zero-shot-gains": zero_shot_gains(),
+    by_task: dict[str, Callable[[str], Row]] = {
+        "paper": table_2,
+        "gains": gains,
+        "table-3": table_3,
+        "zero-shot": zero_shot,
+        "zero-shot-gains": zero_shot_gains,
+    }
+    found = {name: [{"task": task, **row(task)} for task in TASKS] for name, row in by_task.items()}
+    found |= {
         "figure-5-paper": counts("phase-1", "paper", wrong_choices),
         "figure-5-strong": counts("phase-1", "strong", wrong_choices),
         "figure-6": counts("pairs-5000", "paper", changes),

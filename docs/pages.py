@@ -1,6 +1,6 @@
 """What the scripts of the pages share: reading results, and writing tables into pages.
 
-A page shows a table between ``<!-- NAME -->`` and ``<!-- /NAME -->``.
+A page shows a table between ``<!-- NAME -->`` and ``<!-- /NAME -->``; a test compares the two.
 """
 
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from ifo_grounding.files import atomic_write, read_json
+from ifo_grounding.files import read_json
 from ifo_grounding.report.results import brief, unpacked
 from ifo_grounding.stats import Difference, Rate, paired_difference, two_level_bootstrap
 
@@ -40,13 +40,9 @@ def renewed(text: str, tables: Mapping[str, str]) -> str:
 def write(tables: Mapping[str, str], pictures: Mapping[str, bytes]) -> None:
     """Write tables into every page that shows them, and pictures into ``docs/assets``."""
     for page in pages():
-        text = page.read_text()
-        if (said := renewed(text, tables)) != text:
-            with atomic_write(page) as temporary:
-                temporary.write_text(said)
+        page.write_text(renewed(page.read_text(), tables))
     for name, content in pictures.items():
-        with atomic_write(ASSETS / name) as temporary:
-            temporary.write_bytes(content)
+        (ASSETS / name).write_bytes(content)
 
 
 def read(folder: str, key: Callable[[dict[str, Any]], Any]) -> dict[Any, Runs]:
@@ -69,7 +65,12 @@ def difference(runs: Runs, first: str, second: str) -> Difference:
 
 
 def success(runs: Runs | None, name: str) -> str:
-    return brief(rate(runs, name)) if runs else NOT_RUN
+    """Return how often a policy succeeds, where every seed ran it."""
+    return brief(rate(runs, name)) if runs and ran(runs, name) else NOT_RUN
+
+
+def ran(runs: Runs, name: str) -> bool:
+    return all(name in run["results"] for run in runs)
 
 
 def gain(runs: Runs | None) -> str:

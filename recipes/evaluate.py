@@ -27,12 +27,12 @@ from ifo_grounding.evaluation import (
     SuccessResult,
     compare_endings,
     compare_success,
-    return_correlation,
+    return_audit,
     reward_audit,
     success_rate,
 )
 from ifo_grounding.report import results_table
-from ifo_grounding.report.results import packed
+from ifo_grounding.report.results import by_scene
 from ifo_grounding.training import Run
 from ifo_grounding.transforms import GoalReward, LearnedReward
 
@@ -94,7 +94,7 @@ def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[st
 def success_results(measured: dict[str, SuccessResult]) -> dict[str, Any]:
     """Return what was measured as plain values, with the success on every scene."""
     return {
-        name: {**success.as_dict(), "outcomes": packed(success.outcomes)}
+        name: {**success.as_dict(), **by_scene(success.outcomes)}
         for name, success in measured.items()
     }
 
@@ -135,12 +135,12 @@ def evaluate_rewards(policy: Any, run: Run, options: Options) -> dict[str, Any]:
             demos, truth = world.demonstrate(HELD_OUT, seed=scenes["seed"], stream=scenes["stream"])
             assert truth is not None
             results["action_reward"] = reward_audit(model, demos, truth).as_dict()
-        audit = return_correlation(policy, LearnedReward(model), env, average=True, **shown)
+        audit = return_audit(policy, LearnedReward(model), env, average=True, **shown)
         results["action_return"] = audit.as_dict()
     if (run / GOAL).exists():
         classifier = load_network(run, GOAL, "train_goal", options)
         reward = GoalReward(classifier, stop_action=world.stop_action)
-        results["goal_return"] = return_correlation(policy, reward, env, **shown).as_dict()
+        results["goal_return"] = return_audit(policy, reward, env, **shown).as_dict()
     return results
 
 
@@ -172,7 +172,7 @@ def audit_callback(
     def audit(step: int) -> dict[str, float]:
         result = success_rate(policy, env, mode="both", **shown)
         assert result.sampled is not None
-        paid = return_correlation(policy, reward, waiting, **shown)
+        paid = return_audit(policy, reward, waiting, **shown)
         found = {
             "success": result.rate.rate,
             "success_low": result.rate.low,

@@ -46,7 +46,7 @@ def main(options: Options) -> None:
     else:
         names = world_of(options).actions
         rows = [{**row, "action": names[row["action"]]} for row in found["confidence"]]
-        print(text_table(rows, title="confidence of the labels"))
+        print("confidence of the labels", text_table(rows), sep="\n")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,6 @@ from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.files import read_json
 from ifo_grounding.report import (
     animation,
-    audit_figure,
     reliability_diagram,
     results_rows,
     trace_animation,
@@ -47,6 +46,21 @@ CURVES = {
         ["learned_return", "episode_length", "stopped", "entropy", "served_share", "clip_fraction"],
     ),
 }
+AUDIT = {
+    "Learned return and true success": {
+        "audit_return": "learned return",
+        "audit_success": "true success",
+    },
+    "True success": {"success": "greedy", "success_sampled": "sampled"},
+    "Chosen instructions": {"suitable": "suitable", "served_share": "states served"},
+    "Learned rewards against the truth (AUC)": {
+        "return_auc": "return: success above failure",
+        "action_auc": "reward: expert's action above another",
+    },
+    "Episode length": {"episode_length": "steps"},
+    "Entropy of the policy": {"entropy": "nats"},
+}
+"""Reward hacking shows in the first panel: the learned return rises, and true success does not."""
 EPISODES, TRACED = 4, 2
 TILE_SIZE = 32
 """Of a cell in animations, for people."""
@@ -137,14 +151,11 @@ def curves(run: Run) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for stage, (title, wanted) in CURVES.items():
         path = run / "metrics" / f"{stage}.json"
-        if not path.exists():
-            continue
-        history = read_json(path)
-        found[title] = training_curves(
-            history, [name for name in wanted if any(name in row for row in history)]
-        )
-        if stage == "self_examine":
-            found["Audit of self-examination (validation scenes)"] = audit_figure(history)
+        if path.exists():
+            found[title] = training_curves(read_json(path), wanted)
+            if stage == "self_examine":
+                title = "Audit of self-examination (validation scenes)"
+                found[title] = training_curves(read_json(path), AUDIT)
     return found
 
 

@@ -1,7 +1,6 @@
 """Tables of results say what the committed files say."""
 
 import re
-from itertools import product
 from pathlib import Path
 
 import make_results
@@ -90,69 +89,6 @@ def test_a_study_compares_policies_over_its_seeds(results):
     assert list(row.values()) == ["pick", "90.0%", "50.0%", "60.0%"]
 
 
-def test_levels_of_babyai_are_compared_with_their_references(results):
-    solved = {"phase1": "f0", "phase2": "f0", "true_actions": "f8"}
-    measured = {name: policy(bits) for name, bits in solved.items()}
-    run = piece("GoToObj", measured, demonstrations={"n": 1000})
-    write_json(results / "babyai" / "0.json", run)
-    [row] = make_results.babyai_rows()
-    assert row["bot"] == "not run"
-    assert row["true actions"].startswith("62.5% [")
-    assert row["gain, points"] == "phase 1 kept"
-    assert row["minutes"] == 12  # without the references
-
-
 def test_gains_of_the_paper_have_newcombes_interval():
     gain = make_tables.gain_of_paper(wilson(48, 80), wilson(56, 70))
     assert gain == "+20.0 [+5.2, +33.4]"  # 0.0524 and 0.3339 in his table II, method 10
-
-
-def test_the_tables_of_the_paper_are_made_from_pieces(results):
-    def rate(successes, count):
-        return wilson(successes, count).as_dict()
-
-    errors = dict.fromkeys(make_tables.ERRORS, 0) | {"missing": 15}
-    changes = {part: dict.fromkeys(make_tables.FAILURES, 0) for part in ("gained", "lost")}
-    changes["gained"]["stuck"] = 2
-    measured = {
-        "phase1": policy("f0"),
-        "phase2": policy("fc"),
-        "continued": policy("f8"),
-        "changes": {**changes, "other path": 1, "same path": 3},
-        "suitability": {
-            "rate": rate(60, 80),
-            "served": rate(80, 100),
-            "servable": rate(90, 100),
-            "errors": errors,
-        },
-        "trained": {"phase1": {"counts": {"success": 9, "stuck": 1}}},
-    }
-    phases = ("phase-1", "pairs-5000", "goal-continued", "zero-shot", "zero-shot-unseen")
-    for task, preset, phase in product(make_tables.TASKS, make_tables.PRESETS, phases):
-        run = piece(task, measured, network=preset, variant=phase)
-        write_json(results / "tables" / f"{task}-{preset}-{phase}.json", run)
-    pick = make_tables.TASKS.index("pick")
-    row = make_tables.table_2()[pick]
-    assert row["the paper, 1"] == "13.0% [10.3, 16.2]"
-    assert row["the paper, best 2"].startswith("15.4% [")
-    assert row["`strong`, 1"].startswith("50.0% [") and row["`strong`, 2"].startswith("75.0% [")
-    row = make_tables.gain_rows()[pick]
-    assert row["`paper`, 5,000 pairs"].startswith("+25.0 [")
-    assert row["`paper`, 10,000 pairs"] == row["paid for goals"] == "not run"
-    assert row["imitation continued"].startswith("+12.5 [")
-    assert make_tables.table_3()[pick] == {
-        "task": "pick",
-        "the paper": "90.2%",
-        "`paper`": "75.0% [75.0, 75.0]",
-        "`paper`, served": "80.0%",
-        "`strong`": "75.0% [75.0, 75.0]",
-        "`strong`, served": "80.0%",
-        "can be served": "90.0%",
-    }
-    row = make_tables.zero_shot()[pick]
-    assert row["the paper, 1 / 2"] == "11.2% / 14.6%"
-    assert row["`paper`, new / other pairs"].endswith("] / 90.0%")
-    row = make_tables.counts("phase-1", "paper", make_tables.wrong_choices)[pick]
-    assert (row["seeds"], row["missing"], row["occupied"]) == (1, "15", "0")
-    row = make_tables.counts("pairs-5000", "paper", make_tables.changes)[pick]
-    assert (row["stuck"], row["both, other / same path"]) == ("2 / 0", "1 / 3")

@@ -11,15 +11,20 @@ from scipy import stats as scipy_stats
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.stats import (
-    Rate,
     auc,
-    correlation,
     holm,
     paired_difference,
+    rates,
     reliability,
     two_level_bootstrap,
     wilson,
 )
+
+
+@pytest.fixture
+def few_resamples(monkeypatch):
+    """P-values alone are asked for: bootstraps may be short."""
+    monkeypatch.setattr(rates, "RESAMPLES", 10)
 
 
 def test_wilson_by_hand():
@@ -53,24 +58,6 @@ def test_rate_reads_as_a_person_writes_it():
     # Nor is what is not known of one that never came.
     assert str(wilson(20_000, 20_000)) == "100.00% [99.98, 100.00] (n=20000)"
     assert str(wilson(0, 100_000)) == "0.000% [0.000, 0.004] (n=100000)"
-    assert Rate(0.5, 0.4, 0.6, 5, 10).as_dict() == {
-        "rate": 0.5,
-        "low": 0.4,
-        "high": 0.6,
-        "successes": 5,
-        "count": 10,
-        "method": "wilson",
-    }
-
-
-def test_bootstrap_of_one_seed_is_close_to_the_normal_interval():
-    outcomes = np.zeros(1000, bool)
-    outcomes[:300] = True
-    rate = two_level_bootstrap(outcomes, resamples=20_000)
-    half = 1.96 * math.sqrt(0.3 * 0.7 / 1000)  # 0.0284
-    assert rate.rate == 0.3
-    assert rate.low == pytest.approx(0.3 - half, abs=0.002)
-    assert rate.high == pytest.approx(0.3 + half, abs=0.002)
 
 
 def test_bootstrap_counts_the_spread_of_seeds():
@@ -97,7 +84,7 @@ def test_bootstrap_draws_as_one_by_one_would():
     for _ in range(10_000):
         seed, scene = rng.integers(3, size=(3, 1)), rng.integers(60, size=(1, 60))
         means.append(values[seed, scene].mean())
-    rate = two_level_bootstrap(values, resamples=20_000)
+    rate = two_level_bootstrap(values)
     low, high = np.quantile(means, (0.025, 0.975))
     assert rate.low == pytest.approx(low, abs=0.012)  # two steps of 1 / 180
     assert rate.high == pytest.approx(high, abs=0.012)
@@ -107,14 +94,12 @@ def test_bootstrap_draws_as_one_by_one_would():
 def test_bootstrap_refuses_what_is_not_a_table_of_outcomes(bad):
     with pytest.raises(UserError, match="outcomes must be"):
         two_level_bootstrap(bad)
-    with pytest.raises(UserError, match="resamples"):
-        two_level_bootstrap([1, 0], resamples=0)
 
 
 def test_paired_difference_by_hand():
     before = np.array([1] * 80 + [0] * 20)
     after = np.array([1] * 78 + [0] * 2 + [1] * 12 + [0] * 8)
-    difference = paired_difference(before, after, resamples=20_000)
+    difference = paired_difference(before, after)
     assert difference.points == pytest.approx(10.0)
     assert (difference.better, difference.worse, difference.count) == (12, 2, 100)
     # Variance of one scene's change: 14/100 - 0.1^2 = 0.13; half 1.96 * sqrt(0.13 / 100) = 7.07.
@@ -153,51 +138,53 @@ def test_paired_difference_over_seeds_needs_agreement_of_seeds():
     assert 0 < paired_difference([[0], [0], [1]], [[1], [0], [1]]).p_value <= 1  # of one scene
 
 
-@pytest.mark.parametrize("seeds", [2, 3, 5])
-def test_the_noise_of_few_seeds_passes_for_a_gain_no_more_often_than_it_says(seeds):
+@pytest.mark.parametrize("seeds", [2, 5])
+def test_the_noise_of_few_seeds_passes_for_a_gain_no_more_often_than_it_says(few_resamples, seeds):
     # Training moves each seed's success by five points, up as often as down.
     rng = np.random.default_rng(seeds)
     found = 0
-    for _ in range(300):
+    for _ in range(150):
         before = rng.random((seeds, 200)) < 0.8
         after = rng.random((seeds, 200)) < 0.8 + rng.normal(0, 0.05, (seeds, 1))
-        found += paired_difference(before, after, resamples=10).p_value < 0.05
-    assert found <= 24  # 5% would be 15; a binomial with 0.05 exceeds 24 in 1 of 100
+        found += paired_difference(before, after).p_value < 0.05
+    assert found <= 14  # 5% would be 7.5; a binomial with 0.05 exceeds 14 in 1 of 100
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.02])
-def test_a_gain_over_seeds_that_share_no_luck_of_scenes_is_found_as_by_a_t_test(spread):
+def test_a_gain_over_seeds_that_share_no_luck_of_scenes_is_found_as_by_a_t_test(
+    few_resamples, spread
+):
     rng = np.random.default_rng(1)
     found, expected = [], []
     for _ in range(40):
         before = rng.random((5, 1000)) < 0.9
         after = rng.random((5, 1000)) < 0.91 + rng.normal(0, spread, (5, 1))
-        found.append(paired_difference(before, after, resamples=10).p_value)
+        found.append(paired_difference(before, after).p_value)
         change = (after * 1.0 - before).mean(1)
         expected.append(scipy_stats.ttest_1samp(change, 0).pvalue)
     assert np.median(found) == pytest.approx(np.median(expected), rel=0.25)
 
 
-def test_the_luck_of_shared_scenes_passes_for_a_gain_no_more_often_than_it_says():
+def test_the_luck_of_shared_scenes_passes_for_a_gain_no_more_often_than_it_says(few_resamples):
     rng = np.random.default_rng(0)
     found = alone = 0
-    for _ in range(300):
+    for _ in range(150):
         luck = rng.choice([-0.3, 0.3], 200)  # of a scene, whatever the seed
         before = rng.random((5, 200)) < 0.5
         after = rng.random((5, 200)) < 0.5 + luck
-        found += paired_difference(before, after, resamples=10).p_value < 0.05
+        found += paired_difference(before, after).p_value < 0.05
         alone += scipy_stats.ttest_1samp((after * 1.0 - before).mean(1), 0).pvalue < 0.05
-    assert found <= 24 < alone  # 5% would be 15
+    assert found <= 14 < alone  # 5% would be 7.5
 
 
 @pytest.mark.parametrize("seeds", [2, 3])
-def test_seeds_that_gain_as_much_by_chance_are_no_proof(seeds):
+def test_seeds_that_gain_as_much_by_chance_are_no_proof(few_resamples, seeds):
     before, after = np.zeros((2, seeds, 100))
     after[range(seeds), range(seeds)] = 1  # each gains one scene, each another one
     assert paired_difference(before, after).p_value > 0.2
     rng = np.random.default_rng(seeds)
-    noise = (rng.random((400, seeds, 200)) < 0.01) * rng.choice([-1, 1], (400, seeds, 200))
-    found = [paired_difference(change < 0, change > 0, resamples=1).p_value for change in noise]
+    noise = (rng.random((200, seeds, 200)) < 0.01) * rng.choice([-1, 1], (200, seeds, 200))
+    found = [paired_difference(change < 0, change > 0).p_value for change in noise]
     assert np.mean(np.array(found) < 0.05) <= 0.08
     assert min(found) > 1e-4
 
@@ -247,8 +234,8 @@ def test_auc_of_groups_knows_that_copies_add_nothing():
     once = area(x, y)
     copied = area(np.repeat(x, 4), np.repeat(y, 4), np.repeat(np.arange(100), 4))
     naive = area(np.repeat(x, 4), np.repeat(y, 4))
-    assert copied.value == pytest.approx(once.value)
-    assert copied.high - copied.low == pytest.approx(once.high - once.low, rel=0.02)
+    found = [copied.value, copied.low, copied.high]
+    assert found == pytest.approx([once.value, once.low, once.high])
     assert naive.high - naive.low < 0.6 * (once.high - once.low)
 
 
@@ -257,18 +244,6 @@ def test_auc_refuses_broken_scores():
         auc([1.0, math.nan], [1, 0])
     with pytest.raises(UserError, match="3 scores need as many"):
         auc([1, 2, 0], [1, 1, 0], groups=[0, 0])
-
-
-def test_correlation_by_hand():
-    # Deviations -2..2 and -1, -2, 0, 2, 1: 8 / 10. Fisher: tanh(atanh(0.8) +- 1.96 / sqrt(2)).
-    found = correlation([1, 2, 3, 4, 5], [2, 1, 3, 5, 4])
-    assert found.value == pytest.approx(0.8)
-    assert found.low == pytest.approx(math.tanh(math.atanh(0.8) - 1.95996 / math.sqrt(2)), abs=1e-5)
-    assert found.high == pytest.approx(
-        math.tanh(math.atanh(0.8) + 1.95996 / math.sqrt(2)), abs=1e-5
-    )
-    with pytest.raises(UserError, match="needs pairs"):
-        correlation([1, 2], [1])
 
 
 def test_reliability_of_a_calibrated_and_of_an_overconfident_forecast():
@@ -281,7 +256,5 @@ def test_reliability_of_a_calibrated_and_of_an_overconfident_forecast():
     assert share == pytest.approx(0.95) and rate.high < 0.6 and rate.count == 1000
     assert reliability([1.0], [True])[0][1].successes == 1
     for wrong in ([0.5], [0, 1]), ([1.2], [1]):
-        with pytest.raises(UserError):
+        with pytest.raises(UserError, match="reliability needs probabilities"):
             reliability(*wrong)
-    with pytest.raises(UserError, match="bins"):
-        reliability([0.5], [1], bins=0)

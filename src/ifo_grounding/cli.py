@@ -18,6 +18,7 @@ from ifo_grounding.errors import UserError, did_you_mean
 USAGE_ERROR = 2
 INTERRUPTED = 130
 CLOSED = 141
+HELP = ("-h", "--help")
 COMMANDS = {
     "demo": ("two_phase", "train and compare both phases on one task, then write a report"),
     "evaluate": ("evaluate", "success rate of a trained policy, with its interval"),
@@ -49,71 +50,26 @@ def one_line_errors() -> Iterator[None]:
         raise SystemExit(INTERRUPTED) from None
 
 
-@contextlib.contextmanager
-def raised_errors() -> Iterator[None]:
-    """Let Hydra raise what is wrong with options, which it prints and exits with otherwise."""
-    before = os.environ.get("HYDRA_FULL_ERROR")
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["HYDRA_FULL_ERROR"]
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = before
-
-
 def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
     """Decorate the function of a recipe script, which takes the options.
 
-    The options are composed by Hydra from ``conf/config.yaml`` and ``name=value`` on the command
-    line, and checked; a recipe with a ``conf/<script name>.yaml`` has options of its own. What is
-    wrong with them, and a :class:`UserError` of the recipe itself, becomes one line on stderr and
-    exit code 2.
-
-    Example of a whole recipe ``recipes/greet.py``::
-
-        @recipe_main
-        def main(options):
-            print("hello", options.task)
-
-        if __name__ == "__main__":
-            main()
+    The options are composed from ``conf/config.yaml`` and ``name=value`` on the command line, and
+    checked; a recipe with a ``conf/<script name>.yaml`` has options of its own. What is wrong with
+    them, and a :class:`UserError` of the recipe itself, becomes one line on stderr and exit code 2.
     """
     script = Path(inspect.getfile(function)).resolve()
 
     @functools.wraps(function)
     def main() -> None:
         with one_line_errors():
-            import hydra
-            from hydra.errors import HydraException
-            from omegaconf import DictConfig, OmegaConf
-            from omegaconf.errors import OmegaConfBaseException
+            from ifo_grounding.options import help_text, options_of_jobs
 
-            from ifo_grounding.options import CONFIG, current, explained, help_text
-
-            asked = {"-h", "--help"}.intersection(sys.argv)
-            sys.argv = [each for each in sys.argv if each not in asked]
-            conf = script.parent / "conf"
-            own = (conf / f"{script.stem}.yaml").exists()
-
-            def job(cfg: DictConfig) -> None:
-                with one_line_errors():
-                    if asked:
-                        print(help_text(script.stem, cfg))
-                    else:
-                        function(OmegaConf.to_object(cfg) if own else current(cfg))
-
-            run = hydra.main(
-                version_base=None,
-                config_path=str(conf),
-                config_name=script.stem if own else CONFIG,
-            )
-            try:
-                with raised_errors():
-                    run(job)()
-            except (HydraException, OmegaConfBaseException) as error:
-                raise explained(error) from None
+            words = [word for word in sys.argv[1:] if word not in HELP]
+            for options in options_of_jobs(script, words):
+                if len(words) < len(sys.argv) - 1:
+                    print(help_text(script.stem, options))
+                else:
+                    function(options)
 
     return main
 
@@ -126,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command, *rest = (list(sys.argv[1:] if arguments is None else arguments)) or ["--help"]
     with one_line_errors():
         asked = rest if command == "run" else [command]
-        if asked[:1] and asked[0] in ("-h", "--help", "help"):
+        if asked[:1] and asked[0] in (*HELP, "help"):
             print(usage())
         elif command == "--version":
             print("ifo-grounding", version("ifo-grounding"))

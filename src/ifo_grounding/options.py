@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
 import inspect
+import itertools
+import json
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
@@ -31,6 +33,8 @@ LARGEST = 2**31 - 1
 """Of whole numbers that are no seeds."""
 CONFIG = "config"
 """Name of the YAML that all recipes begin with."""
+MULTIRUN = ("-m", "--multirun")
+"""One job for each combination of values that options name, such as ``seed=0,1``."""
 
 register()
 
@@ -44,28 +48,55 @@ def options_of(*overrides: str) -> Options:
     >>> options_of("task=pick", "budget=tiny", "seed=3").run
     'pick-strong-tiny-seed3'
     """
+    with _composing(recipes_folder()):
+        return _settled(overrides)
+
+
+def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
+    """Return the options of each job that a command line asks of a script, one mostly.
+
+    A script with a ``conf/<its name>.yaml`` has options of its own.
+    """
+    words = [word for word in arguments if word not in MULTIRUN]
+    own = (script.parent / "conf" / f"{script.stem}.yaml").exists()
+    with _composing(script.parent):
+        jobs = [words] if len(words) == len(arguments) else _combinations(words)
+        if own:
+            return [OmegaConf.to_object(compose(script.stem, job)) for job in jobs]
+        return [_settled(job) for job in jobs]
+
+
+@contextlib.contextmanager
+def _composing(recipes: Path) -> Iterator[None]:
+    """Let Hydra read the YAML of recipes, and say what is wrong in one line."""
     try:
-        with initialize_config_dir(version_base=None, config_dir=str(recipes_folder() / "conf")):
-            return settled(compose(CONFIG, list(overrides)), overrides)
+        with initialize_config_dir(version_base=None, config_dir=str(recipes / "conf")):
+            yield
     except UserError:
         raise
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise explained(error) from None
 
 
-def current(cfg: DictConfig) -> Options:
-    """Return the options of the job that Hydra runs."""
-    return settled(cfg, HydraConfig.get().overrides.task)
+def _combinations(words: Sequence[str]) -> list[list[str]]:
+    """Return every combination of the values that options name, the last option's first."""
+    given = [
+        [f"{each.get_key_element()}={value}" for value in each.sweep_string_iterator()]
+        if each.is_sweep_override()
+        else [str(each.input_line)]
+        for each in OverridesParser.create().parse_overrides([*words])
+    ]
+    return [[*job] for job in itertools.product(*given)]
 
 
-def settled(cfg: DictConfig, overrides: Sequence[str]) -> Options:
+def _settled(overrides: Sequence[str]) -> Options:
     """Return composed options as dataclasses: those of the run, where it has begun.
 
-    With fewer demonstrations than :data:`FEW` the budget of ``strong`` is
-    ``few``, unless one is named. What a run was made with wins over what a command does not name,
-    but for what decides nothing of what it learns (:data:`~ifo_grounding.config.FREE`); what it
-    names otherwise is refused where the run is opened.
+    What a run was made with wins over what a command does not name, but for what decides nothing of
+    what it learns (:data:`~ifo_grounding.config.FREE`); what it names otherwise is refused where
+    the run is opened.
     """
+    cfg = compose(CONFIG, [*overrides])
     _refuse_unknown(cfg)
     named = [each.key_or_group for each in OverridesParser.create().parse_overrides([*overrides])]
     number = _demonstrations(cfg)
@@ -73,7 +104,7 @@ def settled(cfg: DictConfig, overrides: Sequence[str]) -> Options:
         cfg = compose(CONFIG, [*overrides, "budget=few"])
     cfg.demonstrations.n = number  # all that were recorded, not as many as the budget would record
     made = Run(cfg.run).options()
-    return typed(cfg if made is None else _goes_on(cfg, made, named))
+    return _typed(cfg if made is None else _goes_on(cfg, made, named))
 
 
 def _demonstrations(cfg: DictConfig) -> int:
@@ -84,9 +115,8 @@ def _demonstrations(cfg: DictConfig) -> int:
     folder = Path(cfg.recorded)
     if not folder.is_dir():
         raise UserError(f"recorded={folder} is no folder of demonstrations")
-    return min(
-        asked, len(read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder))
-    )
+    recorded = read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder)
+    return min(asked, len(recorded))
 
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Sequence[str]) -> DictConfig:
@@ -100,38 +130,24 @@ def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Sequence[str]) -> Dic
             )
     result = OmegaConf.create({**plain(cfg), **made})
     for name in [*FREE, *named]:
-        if not name.startswith("hydra"):
-            OmegaConf.update(result, name, plain(OmegaConf.select(cfg, name)), merge=False)
+        OmegaConf.update(result, name, plain(OmegaConf.select(cfg, name)), merge=False)
     return result
 
 
-def typed(cfg: DictConfig) -> Options:
-    """Return options as dataclasses, whose ranges are checked.
-
-    Raises:
-        UserError: with the option, what was given and what is allowed.
-    """
+def _typed(cfg: DictConfig) -> Options:
+    """Return options as dataclasses, whose ranges are checked."""
     values = plain(cfg)
-    options = {}
-    for field in dataclasses.fields(Options):
-        value = values[field.name]
-        kind: Any = field.default_factory
-        if dataclasses.is_dataclass(kind):
-            try:
-                value = kind(**value)  # type: ignore[operator]
-            except UserError as error:
-                raise UserError(_placed(str(error), field.name)) from None
-        options[field.name] = value
     for name, value in leaves(values).items():
         if isinstance(value, int) and abs(value) > LARGEST and not name.endswith("seed"):
             raise UserError(f"{name} must be at most {LARGEST:,}, got {value}")
+    options = {}
+    for field in dataclasses.fields(Options):
+        value, kind = values[field.name], field.default_factory
+        try:
+            options[field.name] = kind(**value) if dataclasses.is_dataclass(kind) else value
+        except UserError as error:
+            raise UserError(f"{field.name}: {error}") from None
     return Options(**options)
-
-
-def _placed(error: str, section: str) -> str:
-    """Say in which section the option is that an error begins with."""
-    unknown = error.removeprefix("unknown ")
-    return f"{section}.{error}" if unknown == error else f"unknown {section}.{unknown}"
 
 
 def plain(node: Any) -> Any:
@@ -142,18 +158,13 @@ def plain(node: Any) -> Any:
 
 
 def _refuse_unknown(cfg: DictConfig) -> None:
-    """Refuse what was added to the options, or removed, that a dataclass describes."""
-    known = {field.name: field for field in dataclasses.fields(Options)}
-    for name in [*cfg, *known]:
-        if name not in known:
-            raise UserError(f"unknown option {name!r}{did_you_mean(str(name), known)}")
-        if name not in cfg:
-            raise UserError(f"option {name!r} is needed: do not remove it")
-        kind: Any = known[str(name)].default_factory
-        if dataclasses.is_dataclass(kind):
-            fields = {field.name for field in dataclasses.fields(kind)}
-            for wrong in fields.symmetric_difference(map(str, cfg[name])):
-                raise UserError(f"option {name}.{wrong} cannot be added or removed")
+    """Refuse what ``+name=`` added to the options, and what ``~name`` removed."""
+    trees: Any = plain(Options()), OmegaConf.to_container(cfg)
+    known, given = (
+        {name for name in leaves(tree) if not name.startswith("world")} for tree in trees
+    )
+    for name in sorted(known ^ given):
+        raise UserError(f"option {name} cannot be added or removed{did_you_mean(name, known)}")
 
 
 def explained(error: Exception) -> UserError:
@@ -177,50 +188,48 @@ def explained(error: Exception) -> UserError:
     return UserError(f"{said}: options are written name=value; see --help")
 
 
-def help_text(recipe: str, cfg: DictConfig) -> str:
+def help_text(recipe: str, options: Any) -> str:
     """Return all options with their values and what they mean, section by section."""
-    kind: Any = OmegaConf.get_type(cfg)
     lines = [
         f"{recipe}: options are written name=value, those of a section section.name=value.",
         "",
     ]
-    for group in ("preset", "budget", "world") if kind is Options else ():
+    for group in ("preset", "budget", "world") if isinstance(options, Options) else ():
         files = (recipes_folder() / "conf" / group).glob("*.yaml")
         lines.append(f"  {group}: {', '.join(sorted(path.stem for path in files))}")
-    return "\n".join([*lines, "", *described(kind, plain(cfg))])
+    return "\n".join([*lines, "", *described(type(options), plain(options))])
 
 
 def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[str]:
     """Write the options of a dataclass, those with options of their own last."""
     docs = field_docs(kind)
-    fields = dataclasses.fields(kind)
-    sections = [each for each in fields if isinstance(values[each.name], dict)]
-    for each in (*(each for each in fields if each not in sections), *sections):
+    fields = sorted(dataclasses.fields(kind), key=lambda each: isinstance(values[each.name], dict))
+    for each in fields:
         value, name = values[each.name], f"{above}{each.name}"
-        if each in sections:
+        if isinstance(value, dict):
             inner: Any = each.default_factory
-            inner = inner if dataclasses.is_dataclass(inner) else None
-            heading = inspect.getdoc(inner) if inner else docs.get(each.name, "")
-            yield f"\n{name}: {' '.join(str(heading).split())}"
-            if inner:
+            typed = dataclasses.is_dataclass(inner)
+            heading = str(inspect.getdoc(inner)) if typed else docs.get(each.name, "")
+            yield f"\n{name}: {' '.join(heading.split())}"
+            if typed:
                 yield from described(inner, value, f"{name}.")
             else:
-                yield from (f"  {name}.{key}={_written(value[key])}" for key in value)
+                yield from (f"  {name}.{key}={written(v)}" for key, v in leaves(value).items())
             continue
-        text = f"{name}={_written(value)}"
+        text = f"{name}={written(value)}"
         meaning = textwrap.wrap(docs.get(each.name, ""), 62) or [""]
         fits = len(text) <= 36
         yield f"  {text:<36}  {meaning[0]}".rstrip() if fits else f"  {text}"
         yield from (f"{'':<40}{more}" for more in meaning[fits:])
 
 
-def _written(value: Any) -> str:
-    """Write a value as it is given on a command line."""
-    return (
-        {None: "null", True: "true", False: "false"}[value]
-        if value is None or isinstance(value, bool)
-        else str(value)
-    )
+def written(value: Any) -> str:
+    """Write a value as it is given on a command line.
+
+    >>> written(None), written(True), written("pick"), written([1, 2])
+    ('null', 'true', 'pick', '[1, 2]')
+    """
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def field_docs(kind: type) -> dict[str, str]:

@@ -18,7 +18,6 @@ class Expert:
         self.rows_asked = 0
 
     def __call__(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the next action."""
         self.rows_asked += len(td)
         state = WorldState(**dict(td["state"].items()), batch_size=td.batch_size)
         wanted = self.scenes.scenes(td["scene"].squeeze(-1)).wanted
@@ -36,7 +35,6 @@ class Expert:
 
 @pytest.fixture
 def make_expert():
-    """Give the class."""
     return Expert
 
 

@@ -1,20 +1,15 @@
 """What is shown of an episode is what decided it."""
 
-import io
-
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.networks import make_policy, make_reward_model
-from ifo_grounding.report import trace_animation
 from ifo_grounding.tasks import VOCABULARY
 from ifo_grounding.transforms import LearnedReward
 
@@ -60,14 +55,3 @@ def test_reward_models_say_what_the_learned_reward_pays(env):
     np.testing.assert_allclose(trace.rewards["action"], paid.flatten(), rtol=1e-4)
     differs = (frames[:-1] != frames[:1]).flatten(1).float().mean(1)
     np.testing.assert_allclose(trace.rewards["goal"], differs.sigmoid(), rtol=1e-4)
-
-
-def test_every_step_is_a_picture(env):
-    policy = make_policy(env, "strong", seed=0)
-    (episode,) = record_episodes(policy, "pick", [2], max_steps=7)
-    trace = trace_episode(policy, episode)
-    for shown in (2, 30):
-        moving = Image.open(io.BytesIO(trace_animation(trace, steps=shown)))
-        assert moving.n_frames == min(shown, len(episode.actions))
-    with pytest.raises(UserError, match="6 actions and 3 names"):
-        trace_animation(trace, actions="LRS")

@@ -1,6 +1,5 @@
 """Both phases through the recipes: what they make, what is made once, what is refused."""
 
-import json
 import re
 
 import pytest
@@ -12,46 +11,43 @@ from ifo_grounding.files import read_json
 from ifo_grounding.report import results_table
 from ifo_grounding.report.results import by_scene
 from pretended_gpu import pretended_gpu
+from recipes.conftest import make_stages
 
 
-@pytest.mark.parametrize(
-    ("task", "preset", "extra"),
-    [
-        ("pick-udlr", "paper", ["self_examine.pairs=24", "controls.run=true"]),
-        ("move-udlr", "strong", ["world.split=train", "evaluate.split=zero-shot"]),
-    ],
-)
-def test_both_phases_run_through_and_write_a_report(options, tmp_path, task, preset, extra):
+def test_both_phases_of_strong_run_through_and_write_a_report(options, tmp_path):
     from share import share
     from two_phase import two_phase
 
     from report import report
 
-    given = options(f"task={task}", f"preset={preset}", f"results={tmp_path / 'kept'}", *extra)
-    results = two_phase(given)
+    chosen = ["task=move-udlr", "world.split=train", "evaluate.split=zero-shot"]
+    chosen.append(f"results={tmp_path / 'kept'}")
+    first = two_phase(options("until=imitate", *chosen))
     run = tmp_path / "run"
-    phases = {f"policy-phase{phase}.safetensors" for phase in (1, 2)}
-    assert phases <= {path.name for path in run.glob("policy*")}
+    assert "phase2" not in first and "suitability" not in first
+    stages = {path.stem for path in (run / "stages").glob("*.json")}
+    assert "imitate" in stages and "train_instruction" not in stages
+
+    given = options(*chosen)
+    results = two_phase(given)
+    assert results["phase1"] == first["phase1"]
     assert results["phase1"]["scenes"] == results["phase2"]["scenes"]
-    assert results["phase1"]["rate"]["count"] == results["gain"]["count"] == 50
-    assert ("trained" in results) == (given.evaluate.split == "zero-shot")
-    assert ("continued" in results) == given.controls.run
+    assert results["phase1"]["rate"]["count"] == results["gain"]["count"] == 20
+    assert "trained" in results and "continued" not in results
     assert 0 < results["labels"]["rate"]["rate"] <= 1
     table = results_table(results)
     assert "phase 2 - phase 1" in table and "suitable rate" in table
     (file,) = (tmp_path / "kept").glob("*.json")
-    assert file.name == f"{task}-60-{preset}-seed0.json"
+    assert file.name == "move-udlr-60-strong-seed0.json"
     kept = read_json(file)
     assert kept["results"] == results == read_json(run / "result.json")["results"]
-    assert kept["options"]["preset"] == preset and kept["machines"]["imitate"]
+    assert kept["options"]["preset"] == "strong" and kept["machines"]["imitate"]
 
-    page = report(given).read_text()
-    text = re.sub("base64,[A-Za-z0-9+/=]+", "", page)  # which may say anything
+    text = re.sub("base64,[A-Za-z0-9+/=]+", "", report(given).read_text())  # which may say anything
     assert "Self-examination" in text and "http" not in text
-    audit = json.loads((run / "metrics" / "self_examine.json").read_text())
+    audit = read_json(run / "metrics" / "self_examine.json")
     assert [row["step"] for row in audit] == [1, 2]
     assert all("success" in row and "suitable" in row for row in audit)
-    assert ("held_out_accuracy" in audit[-1]) == (preset == "paper")
 
     shared = tmp_path / "shared"
     folders = share(options(f"to={shared}"))
@@ -60,7 +56,7 @@ def test_both_phases_run_through_and_write_a_report(options, tmp_path, task, pre
     trained = networks.load(run / "policy-phase2.safetensors")
     assert all(map(torch.equal, policy.state_dict().values(), trained.state_dict().values()))
     assert policy.vocabulary.decode(torch.tensor([[1]])) == ["circle"]
-    assert f"| Task | {task} |" in (shared / "policy" / "README.md").read_text()
+    assert "| Task | move-udlr |" in (shared / "policy" / "README.md").read_text()
 
     # A second call finds everything done.
     stamps = {path: path.stat().st_mtime_ns for path in run.rglob("*.safetensors")}
@@ -68,49 +64,43 @@ def test_both_phases_run_through_and_write_a_report(options, tmp_path, task, pre
     assert all(path.stat().st_mtime_ns == stamp for path, stamp in stamps.items())
 
 
+def test_both_phases_of_paper_run_through_with_their_control(options, tmp_path):
+    from two_phase import two_phase
+
+    results = two_phase(
+        options("task=pick-udlr", "preset=paper", "self_examine.pairs=24", "controls.run=true")
+    )
+    assert results["continued"]["scenes"] == results["phase2"]["scenes"]
+    assert results["action_reward"] and results["changes"]
+    audit = read_json(tmp_path / "run" / "metrics" / "self_examine.json")
+    assert "held_out_accuracy" in audit[-1]
+
+
 @pytest.mark.parametrize("preset", ["strong", pytest.param("paper", marks=pytest.mark.slow)])
 def test_both_phases_run_on_a_gpu(options, preset):
     from two_phase import two_phase
 
-    sections = ("inverse", "imitate", "instruction", "reward", "goal")
-    few = [f"{section}.batch_size=16" for section in sections]
-    few += ["instruction.steps=5", "goal.steps=5", "self_examine.num_envs=8"]
-    few += ["self_examine.select_episodes=8", "evaluate.audit_episodes=10"]
-    few += ["evaluate.episodes=10", "evaluate.states=20", "device=cuda"]
+    few = ["evaluate.episodes=10", "evaluate.mode=greedy", "self_examine.iterations=1"]
     with pretended_gpu():
-        results = two_phase(options(f"preset={preset}", *few))
+        results = two_phase(options(f"preset={preset}", "device=cuda", *few))
     assert results["phase2"]["rate"]["count"] == 10
     assert results["phase1"]["scenes"] == results["phase2"]["scenes"]
 
 
-def test_until_ends_after_a_stage_and_the_run_goes_on(options, tmp_path):
-    from two_phase import two_phase
-
-    first = two_phase(options("until=imitate"))
-    assert "phase2" not in first and "suitability" not in first
-    stages = {path.stem for path in (tmp_path / "run" / "stages").glob("*.json")}
-    assert "imitate" in stages and "train_instruction" not in stages
-    both = two_phase(options())
-    assert both["phase1"]["rate"] == first["phase1"]["rate"] and "phase2" in both
-
-
-def test_another_option_is_refused_before_anything_is_replaced(options, tmp_path, phase_1):
+def test_another_option_is_refused_before_anything_is_replaced(options, phase_1):
     from imitate import imitate
 
-    phase_1(options())
-    weights = (tmp_path / "run" / "policy-phase1.safetensors").read_bytes()
+    weights = (phase_1 / "policy-phase1.safetensors").read_bytes()
     with pytest.raises(UserError, match=r"made with imitate\.steps=20, not 30.*another run="):
         imitate(options("imitate.steps=30"))
-    assert (tmp_path / "run" / "policy-phase1.safetensors").read_bytes() == weights
+    assert (phase_1 / "policy-phase1.safetensors").read_bytes() == weights
 
 
 def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, phase_1):
     from two_phase import two_phase
 
-    phase_1(options("self_examine.iterations=1"))
-    base = f"base={tmp_path / 'run'}"
-    capsys.readouterr()
-    two_phase(options(base, "self_examine.lr=1e-3", run="second"))
+    base = f"base={phase_1}"
+    two_phase(options(base, "self_examine.lr=1e-3", "until=imitate", run="second"))
     assert "imitate: done before" in capsys.readouterr().out
     files = [tmp_path / run / "policy-phase1.safetensors" for run in ("run", "second")]
     assert files[0].read_bytes() == files[1].read_bytes()
@@ -121,12 +111,11 @@ def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, 
         two_phase(options(f"base={tmp_path / 'none'}", run="fourth"))
 
 
-def test_options_replace_values_of_every_network(options, tmp_path, phase_1):
-    phase_1(options("networks.features=16"), until="train_inverse")
-    inverse = networks.load(tmp_path / "run" / "inverse.safetensors")
+def test_options_replace_values_of_every_network(options, phase_1):
+    inverse = networks.load(phase_1 / "inverse.safetensors")
     assert inverse.network_config.config.features == 16
     with pytest.raises(UserError, match="sentence_rate"):
-        phase_1(options("networks.sentence_rate=0.5", run="second"), until="train_inverse")
+        make_stages(options("networks.sentence_rate=0.5", run="second"), until="train_inverse")
 
 
 def test_a_stage_without_what_it_needs_says_what_to_run(options):
@@ -139,12 +128,12 @@ def test_a_stage_without_what_it_needs_says_what_to_run(options):
         evaluate(options())
 
 
-def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_states(options, phase_1):
+def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_states(options):
     from _shared import load_demonstrations, load_network, open_run
     from train_instruction import fresh_states, losses
 
     given = options("task=pick", "instruction.fresh_states=301", "instruction.trials=3")
-    phase_1(given)
+    make_stages(given, until="imitate")
     run = open_run(given)
     policy = load_network(run, "policy-phase1.safetensors", "imitate", given)
     tried = losses(given, run, load_demonstrations(run), None)
@@ -167,58 +156,44 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
 
 
 @pytest.mark.parametrize("mode", ["greedy", "sampled"])
-def test_changed_scenes_are_shown_of_the_policy_that_was_measured(options, mode, phase_1):
+def test_changed_scenes_are_shown_of_the_policy_that_was_measured(
+    options, mode, phase_1, monkeypatch
+):
     """Actions that were drawn are not drawn again: what they solved may fail in the picture."""
     from _shared import open_run
 
-    from report import episode_pictures
+    import report
 
+    monkeypatch.setattr(report, "step_by_step", lambda *_: {})  # slow to draw
     given = options()
-    phase_1(given)
     run = open_run(given)
     (run / "policy-phase2.safetensors").write_bytes(
         (run / "policy-phase1.safetensors").read_bytes()
     )
-    outcomes = {"phase1": torch.zeros(50), "phase2": torch.ones(50)}
+    outcomes = {"phase1": torch.zeros(20), "phase2": torch.ones(20)}
     results = {
         phase: {"mode": mode, **by_scene(solved.bool())} for phase, solved in outcomes.items()
     }
-    found = episode_pictures(run, given, results)
+    found = report.episode_pictures(run, given, results)
     assert "Episodes of phase 2" in found
     assert ("Solved by phase 2 alone" in found) == (mode == "greedy")
 
 
-def test_what_is_measured_otherwise_is_measured_anew(options, phase_1):
+def test_what_is_measured_otherwise_is_measured_anew(options, capsys, phase_1):
     from evaluate import evaluate
 
-    phase_1(options())
-    assert evaluate(options())["phase1"]["rate"]["count"] == 50
-    again = evaluate(options("evaluate.episodes=40", "evaluate.mode=greedy"))
-    assert again["phase1"]["rate"]["count"] == 40 and "sampled" not in again["phase1"]
-
-
-def test_scenes_of_pairs_that_were_named_are_no_zero_shot(options, capsys, phase_1):
-    from evaluate import evaluate
-
-    phase_1(options())
-    evaluate(options("evaluate.split=zero-shot"))
+    found = evaluate(options("evaluate.episodes=20", "evaluate.mode=sampled"))["phase1"]
+    assert (found["rate"]["count"], found["mode"]) == (20, "sampled")
+    assert not capsys.readouterr().err
+    again = evaluate(
+        options("evaluate.episodes=10", "evaluate.mode=greedy", "evaluate.split=zero-shot")
+    )
+    assert again["phase1"]["rate"]["count"] == 10 and not again["phase1"]["sampled"]
+    # The demonstrations named the pairs of these scenes, too.
     assert "no zero-shot success" in capsys.readouterr().err
 
 
-def test_imitation_goes_on_for_as_many_samples_as_phase_2_takes(options):
-    from controls import matched_steps
-
-    given = options()
-    section = given.self_examine
-    frames = section.iterations * section.num_envs * section.steps
-    auxiliary = frames / section.minibatch * section.epochs * 256
-    samples = frames * (2 * section.epochs + 1 / 3) + auxiliary
-    assert matched_steps(given) == round(samples / given.imitate.batch_size)
-    once = options("self_examine.algorithm=reinforce", "self_examine.imitation_weight=0")
-    assert matched_steps(once) == round(frames * (2 + 1 / 3) / once.imitate.batch_size)
-
-
-def test_the_small_file_of_another_run_is_not_replaced(options, tmp_path, phase_1):
+def test_the_small_file_of_another_run_is_not_replaced(options, tmp_path):
     from _shared import write_result
 
     kept = f"results={tmp_path / 'small files'}"

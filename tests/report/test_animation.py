@@ -27,7 +27,6 @@ from ifo_grounding.tasks import grammar
 
 
 def episode(colours, success, stopped=True):
-    """One frame per colour."""
     frames = np.stack([np.full((3, 48, 48), 0, np.uint8) for _ in colours])
     for frame, colour in zip(frames, colours, strict=True):
         frame[:] = np.array(colour, np.uint8)[:, None, None]
@@ -36,7 +35,6 @@ def episode(colours, success, stopped=True):
 
 
 def frames_of(gif):
-    """Decode all frames."""
     image = Image.open(io.BytesIO(gif))
     result, durations = [], []
     for number in range(image.n_frames):
@@ -47,24 +45,15 @@ def frames_of(gif):
 
 
 def near(pixel, colour):
-    """Whether a pixel has a colour, up to the palette."""
     wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     return np.abs(pixel - wanted).max() < 12
-
-
-def test_actions_have_a_name_or_a_number():
-    shown = episode([(0, 0, 0)] * 3, success=True)
-    shown.actions[:] = 6
-    assert animation([shown])  # more than the grid has
-    with pytest.raises(UserError, match="7 actions and 3 names"):
-        animation([shown], actions="LRS")
 
 
 def test_frames_outcomes_and_waiting():
     short = episode([(255, 0, 0), (0, 0, 255)], success=True)
     long = episode([(0, 255, 0)] * 3 + [(255, 255, 0)], success=False)
-    frames, durations = frames_of(animation([short, long], fps=5, hold=3, width=100))
-    assert durations == [200, 200, 200, 3000]
+    frames, durations = frames_of(animation([short, long], width=100))
+    assert durations == [250, 250, 250, 2500]
     middle = (PADDING + BORDER + 40, PADDING + BORDER + 40)
     cell = 2 * 48 + 2 * BORDER + PADDING + (100 - 96)
     for step, frame in enumerate(frames):
@@ -73,13 +62,6 @@ def test_frames_outcomes_and_waiting():
         edge = frame[PADDING + 1, PADDING + 1]
         assert near(edge, RUNNING if step == 0 else GOOD)
         assert near(frame[PADDING + 1, PADDING + 1 + cell], BAD if step == 3 else RUNNING)
-
-
-def test_columns_make_rows():
-    clips = [episode([(9, 9, 9)] * 2, True)] * 5
-    wide = Image.open(io.BytesIO(animation(clips, columns=5))).size
-    tall = Image.open(io.BytesIO(animation(clips, columns=2))).size
-    assert tall[0] < wide[0] / 2 and tall[1] > 2.5 * wide[1]
 
 
 def test_captions_are_wrapped_not_cut():
@@ -93,6 +75,8 @@ def test_animation_refusals():
         animation([])
     with pytest.raises(UserError, match="one per episode"):
         animation([episode([(0, 0, 0)] * 2, True)], titles=["a", "b"])
+    with pytest.raises(UserError, match="6 actions and 3 names"):
+        animation([episode([(0, 0, 0)] * 2, True)], actions="LRS")
     with pytest.raises(UserError, match=r"uint8 \[3, H, W\]"):
         animation([Episode(np.zeros((2, 48, 48, 3)), np.array([5]), "a", True, True, 0)])
 
@@ -134,4 +118,6 @@ def test_a_step_is_a_picture_and_a_dollar_sign_no_formula():
     shown.actions[:] = 1
     frames, _ = frames_of(trace_animation(trace, actions=["$_", "go", "$}"]))
     assert len(frames) == 2
+    with pytest.raises(UserError, match="3 actions and 6 names"):
+        trace_animation(trace)
     assert frames_of(animation([shown], actions=["$_", "$^"]))

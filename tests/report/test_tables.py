@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.report import format_cell, markdown_table, text_table
+from ifo_grounding.report import markdown_table, text_table
 from ifo_grounding.stats import wilson
 
 ROWS = [
@@ -17,9 +15,8 @@ ROWS = [
 
 
 def test_text_table():
-    assert text_table(ROWS, title="Results") == "\n".join(
+    assert text_table(ROWS) == "\n".join(
         [
-            "Results",
             "task                          success   steps  extra",
             "--------  ---------------------------  ------  -----",
             "move      97.3% [96.5, 97.9] (n=2000)  12,000      –",
@@ -38,14 +35,6 @@ def test_markdown_table():
             r"| pick\|out | – |",
         ]
     )
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(None, "–"), (math.nan, "–"), (True, "yes"), (0.000123456, "0.000123"), ("as is", "as is")],
-)
-def test_cells(value, text):
-    assert format_cell(value) == text
 
 
 @pytest.mark.parametrize("make", [text_table, markdown_table])

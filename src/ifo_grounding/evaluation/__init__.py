@@ -9,15 +9,11 @@ from ifo_grounding.evaluation.recording import Episode, record_episodes
 from ifo_grounding.evaluation.reward import (
     ReturnAudit,
     RewardAudit,
-    return_correlation,
+    return_audit,
     reward_audit,
 )
 from ifo_grounding.evaluation.success import SuccessResult, compare_success, success_rate
-from ifo_grounding.evaluation.suitability import (
-    SuitabilityResult,
-    checked_choices,
-    suitable_rate,
-)
+from ifo_grounding.evaluation.suitability import SuitabilityResult, suitable_rate
 from ifo_grounding.evaluation.tracing import Trace, trace_episode
 
 __all__ = [
@@ -29,13 +25,12 @@ __all__ = [
     "SuccessResult",
     "SuitabilityResult",
     "Trace",
-    "checked_choices",
     "compare_endings",
     "compare_success",
     "episode_endings",
     "label_accuracy",
     "record_episodes",
-    "return_correlation",
+    "return_audit",
     "reward_audit",
     "success_rate",
     "suitable_rate",

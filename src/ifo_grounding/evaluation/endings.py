@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -16,6 +15,7 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.episodes import Outcomes, Policy
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.evaluation.scenes import Player, play_scenes
+from ifo_grounding.stats import Described
 from ifo_grounding.tasks.goals import SIDES, Goal, Plan
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.world import WorldState, neighbour
@@ -27,9 +27,11 @@ SUCCESS, STUCK, WRONG_OBJECT, WRONG_PLACE, NOTHING_DONE = range(5)
 
 
 @dataclass(frozen=True)
-class Endings:
+class Endings(Described):
     """How each of N episodes ended, one per scene; everything on the CPU."""
 
+    counts: dict[str, int]
+    """Episodes by how they ended."""
     kind: Tensor
     """Index into :data:`ENDINGS`, int64 [N]."""
     actions: Tensor
@@ -37,23 +39,8 @@ class Endings:
     scenes: str
     """Hash of the first frames and instructions of all scenes."""
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Episodes by how they ended."""
-        return _counts(self.kind)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON: the counts."""
-        return {"counts": self.counts}
-
-
-def episode_endings(
-    policy: Policy,
-    task: str,
-    *,
-    episodes: int = 2000,
-    **options: Any,
-) -> Endings:
+def episode_endings(policy: Policy, task: str, *, episodes: int = 2000, **options: Any) -> Endings:
     """Play the scenes of :func:`success_rate` and say how each episode ended.
 
     Args:
@@ -68,7 +55,7 @@ def episode_endings(
     """
     numbers = range(at_least_one("episodes", episodes))
     (kind, actions), scenes = play_scenes(policy, task, numbers, _play, **options)
-    return Endings(kind, actions, scenes)
+    return Endings(_counts(kind), kind, actions, scenes)
 
 
 def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
@@ -80,20 +67,19 @@ def compare_endings(before: Endings, after: Endings) -> dict[str, Any]:
         and ``same path``: scenes that both solve.
 
     Raises:
-        UserError: where the two are about different scenes.
+        UserError: where the two are about different scenes, or episodes of different length.
     """
-    if before.scenes != after.scenes:
-        raise UserError("the two are about different scenes: use the same seed and stream")
-    solved = before.kind == SUCCESS, after.kind == SUCCESS
-    paths = [before.actions, after.actions]
-    longest = max(path.shape[1] for path in paths)  # each as long as its episodes could be
-    paths = [F.pad(path, (0, longest - path.shape[1]), value=-1) for path in paths]
-    same = torch.eq(*paths).all(1)
+    if before.scenes != after.scenes or before.actions.shape != after.actions.shape:
+        raise UserError(
+            "the two are about different scenes: use the same seed, stream and max_steps"
+        )
+    first, second = before.kind == SUCCESS, after.kind == SUCCESS
+    same = (before.actions == after.actions).all(1)
     return {
-        "gained": _counts(before.kind[~solved[0] & solved[1]]),
-        "lost": _counts(after.kind[solved[0] & ~solved[1]]),
-        "other path": int((solved[0] & solved[1] & ~same).sum()),
-        "same path": int((solved[0] & solved[1] & same).sum()),
+        "gained": _counts(before.kind[~first & second]),
+        "lost": _counts(after.kind[first & ~second]),
+        "other path": int((first & second & ~same).sum()),
+        "same path": int((first & second & same).sum()),
     }
 
 

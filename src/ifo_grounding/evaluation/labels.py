@@ -63,8 +63,8 @@ def label_accuracy(
             f"labels and truth must be one action per transition of the same demonstrations, got "
             f"{len(given)} and {len(right)}"
         )
-    n = len(names)
-    if int(torch.stack([given, right]).min()) < 0 or int(torch.stack([given, right]).max()) >= n:
+    n, both = len(names), torch.stack([given, right])
+    if int(both.min()) < 0 or int(both.max()) >= n:
         raise UserError(f"actions must be 0..{n - 1}, as there are {n} names")
     hits = right[given == right].bincount(minlength=n).tolist()
     counts = right.bincount(minlength=n).tolist()

@@ -17,10 +17,10 @@ from ifo_grounding.data import Demonstrations, Truth
 from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.evaluation.labels import actions_of
-from ifo_grounding.evaluation.scenes import Player, device_of, play_scenes
-from ifo_grounding.modules import evaluating
+from ifo_grounding.evaluation.scenes import Player, play_scenes
+from ifo_grounding.modules import device_of, evaluating
 from ifo_grounding.seeding import generator
-from ifo_grounding.stats import Described, Estimate, Rate, auc, correlation, wilson
+from ifo_grounding.stats import Described, Estimate, Rate, auc, wilson
 from ifo_grounding.transforms import GoalReward, LearnedReward
 
 AT_ONCE = 1024
@@ -33,8 +33,6 @@ class RewardAudit(Described):
 
     auc: Estimate
     """Probability that an expert's action scores above another action."""
-    per_action: dict[str, Estimate]
-    """The same for one action: where the expert took it against where it did not."""
     first: Rate
     """Share of transitions where the expert's action scores highest."""
 
@@ -66,33 +64,27 @@ def reward_audit(
             not know, or nothing to draw.
     """
     transitions = at_least_one("transitions", transitions)
-    shapes = getattr(reward_model, "shapes", None)
-    names = keys.action_names(getattr(shapes, "n_actions", keys.N_ACTIONS))
+    n_actions = getattr(getattr(reward_model, "shapes", None), "n_actions", keys.N_ACTIONS)
     actions = actions_of(truth)
     if len(actions) != demos.transitions or not len(actions):
         raise UserError(
             f"truth has {len(actions)} actions and the demonstrations {demos.transitions} "
             "transitions: give the truth of these very demonstrations"
         )
-    if int(actions.max()) >= len(names):
+    if int(actions.max()) >= n_actions:
         raise UserError(
-            f"truth has the action {int(actions.max())}, the model knows {len(names)}: give the "
+            f"truth has the action {int(actions.max())}, the model knows {n_actions}: give the "
             "reward model of this world"
         )
     order = torch.randperm(len(actions), generator=generator(seed, "reward-audit"))
     drawn = order[:transitions].sort().values
     episode, frame = demos.locate(drawn)
-    scores = _score_actions(reward_model, demos, episode, frame, len(names))
-    taken = torch.nn.functional.one_hot(actions[drawn], len(names)).bool()
-    group = episode.unsqueeze(1).expand_as(scores).numpy()
+    scores = _score_actions(reward_model, demos, episode, frame, n_actions)
+    taken = torch.nn.functional.one_hot(actions[drawn], n_actions).bool()
     # Ties do not count as first: a model that finds everything right knows nothing.
     others = scores.masked_fill(taken, -torch.inf).max(1).values
     return RewardAudit(
-        auc=auc(scores.numpy(), taken.numpy(), group),
-        per_action={
-            name: auc(scores[:, a].numpy(), taken[:, a].numpy(), group[:, a])
-            for a, name in enumerate(names)
-        },
+        auc=auc(scores, taken, episode.unsqueeze(1).expand_as(scores)),
         first=wilson(int((scores[taken] > others).sum()), len(drawn)),
     )
 
@@ -105,20 +97,16 @@ def _score_actions(
     n_actions: int,
 ) -> Tensor:
     """Logits of every action in every transition, float32 [N, A]."""
-    device, scores = device_of(reward_model), []
-    every = torch.arange(n_actions)
-    instructions = demos.instructions
+    device = device_of(reward_model) or torch.device("cpu")
+    instructions, scores = demos.instructions, []
     with evaluating(reward_model):
         for part in torch.arange(len(frame)).split(max(1, AT_ONCE // n_actions)):
-            pixels, words = demos.frames(frame[part]), instructions[episode[part]]
-            batch = TensorDict(
-                {
-                    keys.PIXELS: pixels.repeat_interleave(n_actions, 0),
-                    keys.INSTRUCTION: words.repeat_interleave(n_actions, 0),
-                    keys.ACTION: every.repeat(len(part)),
-                },
-                batch_size=[n_actions * len(part)],
-            ).to(device)
+            seen = {
+                keys.PIXELS: demos.frames(frame[part]),
+                keys.INSTRUCTION: instructions[episode[part]],
+            }
+            batch = TensorDict(seen, [len(part)]).repeat_interleave(n_actions, dim=0).to(device)
+            batch[keys.ACTION] = torch.arange(n_actions, device=device).repeat(len(part))
             logit = reward_model(batch)[keys.ACTION_SCORE]
             scores.append(logit.float().reshape(len(part), n_actions).cpu())
     return torch.cat(scores)
@@ -128,8 +116,6 @@ def _score_actions(
 class ReturnAudit(Described):
     """Whether episodes with a higher learned return are those that succeed."""
 
-    correlation: Estimate
-    """Point-biserial correlation of learned return and true success."""
     auc: Estimate
     """Probability that a success has a higher learned return than a failure."""
     success: Rate
@@ -140,7 +126,7 @@ class ReturnAudit(Described):
     """True success of each episode, bool [N]."""
 
 
-def return_correlation(
+def return_audit(
     policy: Policy,
     reward: LearnedReward | GoalReward,
     env_or_task: EnvBase | str,
@@ -192,8 +178,7 @@ def return_correlation(
         policy, env_or_task, numbers, play_batch, mode=mode, purpose="return", **options
     )
     return ReturnAudit(
-        correlation=correlation(returns.numpy(), success.numpy()),
-        auc=auc(returns.numpy(), success.numpy()),
+        auc=auc(returns, success),
         success=wilson(int(success.sum()), len(success)),
         returns=returns,
         outcomes=success,

@@ -29,11 +29,6 @@ PlayBatch = Callable[[Player, EnvBase, TensorDictBase], Iterable[Tensor]]
 """Plays a batch of scenes and returns columns, [B, ...] each."""
 
 
-def device_of(module: object) -> torch.device:
-    """Return the device of a module's first parameter or buffer, else the CPU."""
-    return modules.device_of(module) or torch.device("cpu")
-
-
 def play_scenes(
     policy: Policy,
     env_or_task: EnvBase | str,
@@ -70,7 +65,7 @@ def play_scenes(
         env: EnvBase = PickAndPlaceEnv(
             env_or_task,
             num_envs=min(at_least_one("batch_size", batch_size), len(numbers)),
-            device=device_of(policy) if device is None else torch.device(device),
+            device=torch.device(device or modules.device_of(policy) or "cpu"),
             seed=seed,
             stream=stream,
             max_steps=limit,

@@ -35,11 +35,6 @@ class SuccessResult(Described):
     sampled: SuccessResult | None = None
     """The sampled policy's result on the same scenes, where ``both`` were asked for."""
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, without the outcome of every scene."""
-        values = {**super().as_dict(), "mean_length": float(self.lengths.double().mean())}
-        return {name: value for name, value in values.items() if value is not None}
-
 
 def success_rate(
     policy: Policy,
@@ -111,22 +106,18 @@ def success_rate(
     )
 
 
-def compare_success(before: SuccessResult, after: SuccessResult, **options: Any) -> Difference:
+def compare_success(before: SuccessResult, after: SuccessResult) -> Difference:
     """Return the paired difference of two results on the same scenes.
 
     Args:
         before: result of the first policy.
         after: result of the second.
-        options: of :func:`~ifo_grounding.stats.paired_difference`.
 
     Raises:
         UserError: where the scenes or the modes differ.
     """
     if before.scenes != after.scenes or len(before.outcomes) != len(after.outcomes):
-        raise UserError(
-            f"the results are about different scenes ({len(before.outcomes)}, {before.scenes}; "
-            f"{len(after.outcomes)}, {after.scenes}): use the same seed, stream and options"
-        )
+        raise UserError("the two are about different scenes: use the same seed, stream and options")
     if before.mode != after.mode:
         raise UserError(f"cannot compare a {before.mode} with a {after.mode} policy")
-    return paired_difference(before.outcomes.numpy(), after.outcomes.numpy(), **options)
+    return paired_difference(before.outcomes.numpy(), after.outcomes.numpy())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from scipy import stats as scipy_stats
@@ -12,7 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, whole
-from ifo_grounding.evaluation.scenes import MAX_STEPS, device_of
+from ifo_grounding.evaluation.scenes import MAX_STEPS
+from ifo_grounding.modules import device_of
 from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Described, Estimate, Rate, auc, reliability, wilson
 from ifo_grounding.tasks.goals import REASONS, Goal, verdict
@@ -26,19 +27,6 @@ from ifo_grounding.world import WorldState, render
 NOT_SERVED = -1
 SERVABLE_STATES = 500
 """States for which the oracle goes through the whole pool."""
-
-
-class CheckedChoices(NamedTuple):
-    """What was chosen for some states, and what is wrong with it."""
-
-    state: WorldState
-    """The states, [B]."""
-    chosen: Tensor
-    """Index of the chosen instruction in the pool, int64 [B]; -1 where none was above threshold."""
-    score: Tensor
-    """Its probability of being suitable, float32 [B]."""
-    verdict: Tensor
-    """Index into :data:`~ifo_grounding.tasks.REASONS`, int64 [B]; -1 where none was chosen."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +51,19 @@ class SuitabilityResult(Described):
     """Share of suitable pairs among random pairs above the threshold."""
     recall: Rate
     """Share of random suitable pairs that are above the threshold."""
-    base_rate: Rate
-    """Share of suitable pairs among random pairs of a state and an instruction of the pool."""
     auc: Estimate
     """Probability that a suitable pair scores above an unsuitable one."""
     reliability: list[tuple[float, Rate]]
     """Of random pairs, by bins of the probability that they are said to have: its mean, and the
     share that is suitable. Equal where the module is calibrated."""
+    state: WorldState
+    """The states, [N], on the CPU as what follows."""
+    chosen: Tensor
+    """Index of the instruction that was chosen for each, int64 [N]; -1 where none was."""
+    score: Tensor
+    """Its probability of being suitable, float32 [N]."""
+    verdict: Tensor
+    """Index into :data:`~ifo_grounding.tasks.REASONS`, int64 [N]; -1 where none was chosen."""
 
 
 def suitable_rate(
@@ -124,111 +118,49 @@ def suitable_rate(
     if whole("pairs_per_state", pairs_per_state) < 0:
         raise UserError(f"pairs_per_state must not be negative, got {pairs_per_state}")
     states, batch_size = at_least_one("states", states), at_least_one("batch_size", batch_size)
-    examiner = _Examiner(
-        classifier, task, pool, seed, stream, tile_size, max_steps, **scene_options
+    device = device_of(classifier) or torch.device("cpu")
+    tokens, of_pool = read_pool(task, pool)
+    goals = of_pool.to(device)
+    scorer = PoolScorer(classifier, tokens.to(device))
+    draw = generator(seed, "suitability", stream)
+    options = SceneOptions(
+        task, instructed=False, stream=stream, max_steps=max_steps, **scene_options
     )
-    chosen, verdicts, pairs = [], [], []
-    servable: list[bool] = []
-    for numbers in torch.arange(states).split(batch_size):
-        state, pixels = examiner.fresh(numbers)
-        checked = examiner.choices(
-            state, pixels, threshold=threshold, candidates=candidates, choose=choose
-        )
-        chosen.append(checked.chosen.cpu())
-        verdicts.append(checked.verdict.cpu())
-        if left := SERVABLE_STATES - len(servable):
-            servable += examiner.servable(state[:left])
+    scenes = SceneStream(options, seed, device)
+    how: dict[str, Any] = {"threshold": threshold, "candidates": candidates, "choose": choose}
+    found, pairs = [], []
+    for numbers in torch.arange(states, device=device).split(batch_size):
+        state = scenes.scenes(numbers).state
+        pixels = render(state, tile_size)
+        chosen, score = scorer.choose(pixels, generator=draw, **how)
+        reason = verdict(state, goals[chosen.clamp_min(0)], max_steps)
+        reason = reason.where(chosen >= 0, NOT_SERVED)
+        found.append([part.cpu() for part in (state, chosen, score, reason)])
         if pairs_per_state:
-            pairs.append(examiner.random_pairs(state, pixels, pairs_per_state))
-    index, found = torch.cat(chosen), torch.cat(verdicts)
-    served = found != NOT_SERVED
-    n_served, n_suitable = int(served.sum()), int((found == 0).sum())
+            index = torch.randint(len(goals), (len(pixels), pairs_per_state), generator=draw)
+            index = index.to(device)
+            suits = [verdict(state, goals[each], max_steps) == 0 for each in index.unbind(1)]
+            logits = scorer.score(scorer.encode(pixels), index)
+            pairs.append((logits.cpu(), torch.stack(suits, 1).cpu()))
+    columns: Any = [torch.cat(column) for column in zip(*found, strict=True)]
+    state, chosen, score, reason = columns
+    # Equal goals of the pool share a number, int64 [pool].
+    fields = torch.stack([getattr(of_pool, name) for name in FIELDS], dim=-1)
+    goal_numbers = fields.unique(dim=0, return_inverse=True)[1]
+    counts = reason[reason >= 0].bincount(minlength=len(REASONS)).tolist()
     return SuitabilityResult(
-        rate=wilson(n_suitable, n_served),
-        served=wilson(n_served, states),
-        servable=wilson(sum(servable), len(servable)),
-        errors={REASONS[kind]: int((found == kind).sum()) for kind in range(1, len(REASONS))},
-        entropy=_entropy_bits(examiner.goal_numbers[index[served]]),
-        most_entropy=_entropy_bits(examiner.goal_numbers.unique()),
+        rate=wilson(counts[0], sum(counts)),
+        served=wilson(sum(counts), states),
+        servable=_servable(state[:SERVABLE_STATES].to(device), goals, goal_numbers, max_steps),
+        errors=dict(zip(REASONS[1:], counts[1:], strict=True)),
+        entropy=_entropy_bits(goal_numbers[chosen[chosen >= 0]]),
+        most_entropy=_entropy_bits(goal_numbers.unique()),
         **_threshold_quality(pairs, threshold),
+        state=state,
+        chosen=chosen,
+        score=score,
+        verdict=reason,
     )
-
-
-def checked_choices(
-    classifier: TensorDictModuleBase,
-    task: str,
-    pool: Tensor | Sequence[str],
-    *,
-    states: int,
-    threshold: float = 0.8,
-    candidates: int = 64,
-    choose: str = "random",
-    **options: Any,
-) -> CheckedChoices:
-    """Return what is chosen for a few fresh states; arguments as :func:`suitable_rate`."""
-    examiner = _Examiner(classifier, task, pool, **options)
-    fresh = examiner.fresh(torch.arange(at_least_one("states", states)))
-    return examiner.choices(*fresh, threshold=threshold, candidates=candidates, choose=choose)
-
-
-class _Examiner:
-    """Lets a classifier choose for fresh states, and asks the oracle."""
-
-    def __init__(
-        self,
-        classifier: TensorDictModuleBase,
-        task: str,
-        pool: Tensor | Sequence[str],
-        seed: int = 0,
-        stream: str = "evaluation",
-        tile_size: int = 8,
-        max_steps: int = MAX_STEPS,
-        **scene_options: Any,
-    ) -> None:
-        self.device, self.tile_size, self.max_steps = device_of(classifier), tile_size, max_steps
-        tokens, goals = read_pool(task, pool)
-        self.goals = goals.to(self.device)
-        fields = torch.stack([getattr(goals, name) for name in FIELDS], dim=-1)
-        self.goal_numbers = fields.unique(dim=0, return_inverse=True)[1]
-        """Equal goals of the pool share a number, int64 [N], on the CPU."""
-        self.scorer = PoolScorer(classifier, tokens.to(self.device))
-        self.draw = generator(seed, "suitability", stream)
-        options = SceneOptions(
-            task=task, instructed=False, stream=stream, max_steps=max_steps, **scene_options
-        )
-        self.scenes = SceneStream(options, seed, self.device)
-
-    def fresh(self, numbers: Tensor) -> tuple[WorldState, Tensor]:
-        """Return states without instructions, by their numbers [B], and their pictures."""
-        state = self.scenes.scenes(numbers.to(self.device)).state
-        return state, render(state, self.tile_size)
-
-    def choices(self, state: WorldState, pixels: Tensor, **options: Any) -> CheckedChoices:
-        """Let the classifier choose."""
-        index, score = self.scorer.choose(pixels, generator=self.draw, **options)
-        found = verdict(state, self.goals[index.clamp_min(0)], self.max_steps)
-        return CheckedChoices(state, index, score, torch.where(index < 0, NOT_SERVED, found))
-
-    def servable(self, state: WorldState) -> list[bool]:
-        """Say for each state [B] whether any goal of the pool suits it."""
-        rows = {number: row for row, number in enumerate(self.goal_numbers.tolist())}
-        found = torch.zeros(len(state), dtype=torch.bool, device=self.device)
-        for row in rows.values():
-            goal = self.goals[row : row + 1].expand(len(state))
-            found |= verdict(state, goal, self.max_steps) == 0
-        return found.tolist()
-
-    def random_pairs(
-        self, state: WorldState, pixels: Tensor, per_state: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return logits [B, K] of random pairs, and whether they are suitable, bool [B, K]."""
-        index = torch.randint(len(self.goals), (len(pixels), per_state), generator=self.draw)
-        index = index.to(self.device)
-        truth = [
-            verdict(state, self.goals[column], self.max_steps) == 0 for column in index.unbind(1)
-        ]
-        logits = self.scorer.score(self.scorer.encode(pixels), index)
-        return logits.cpu(), torch.stack(truth, 1).cpu()
 
 
 def read_pool(task: str, pool: Tensor | Sequence[str]) -> tuple[Tensor, Goal]:
@@ -238,6 +170,15 @@ def read_pool(task: str, pool: Tensor | Sequence[str]) -> tuple[Tensor, Goal]:
         raise UserError("pool is empty: pass at least one instruction")
     tokens = tokens.to("cpu", torch.int64)
     return tokens, grammar(task).parse_tokens(tokens)
+
+
+def _servable(state: WorldState, goals: Goal, goal_numbers: Tensor, max_steps: int) -> Rate:
+    """Return the share of states [B] that any goal of a pool suits."""
+    rows = {number: row for row, number in enumerate(goal_numbers.tolist())}
+    suits = torch.zeros(len(state), dtype=torch.bool, device=goals.side.device)
+    for row in rows.values():
+        suits |= verdict(state, goals[row : row + 1].expand(len(state)), max_steps) == 0
+    return wilson(int(suits.sum()), len(state))
 
 
 def _entropy_bits(values: Tensor) -> float:
@@ -255,7 +196,6 @@ def _threshold_quality(pairs: list[tuple[Tensor, Tensor]], threshold: float) -> 
     return {
         "precision": wilson(hits, int(above.sum())),
         "recall": wilson(hits, int(truth.sum())),
-        "base_rate": wilson(int(truth.sum()), truth.numel()),
-        "auc": auc(logits.numpy(), truth.numpy(), group.numpy()),
-        "reliability": reliability(logits.sigmoid().numpy(), truth.numpy()),
+        "auc": auc(logits, truth, group),
+        "reliability": reliability(logits.sigmoid(), truth),
     }

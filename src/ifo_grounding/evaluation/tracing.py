@@ -12,8 +12,7 @@ from tensordict.nn import TensorDictModule
 
 from ifo_grounding import keys
 from ifo_grounding.evaluation.recording import Episode
-from ifo_grounding.evaluation.scenes import device_of
-from ifo_grounding.modules import evaluating, output_key
+from ifo_grounding.modules import device_of, evaluating, output_key
 from ifo_grounding.networks import attention_maps
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 

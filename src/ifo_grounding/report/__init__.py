@@ -4,12 +4,7 @@ from ifo_grounding.report.animation import animation
 from ifo_grounding.report.casestudy import instruction_cases
 from ifo_grounding.report.drawing import Captioned, gallery
 from ifo_grounding.report.page import write_report
-from ifo_grounding.report.plots import (
-    audit_figure,
-    rates_by_number,
-    reliability_diagram,
-    training_curves,
-)
+from ifo_grounding.report.plots import rates_by_number, reliability_diagram, training_curves
 from ifo_grounding.report.provenance import provenance
 from ifo_grounding.report.results import results_rows, results_table
 from ifo_grounding.report.tables import format_cell, markdown_table, text_table
@@ -19,7 +14,6 @@ from ifo_grounding.report.tracing import trace_animation
 __all__ = [
     "Captioned",
     "animation",
-    "audit_figure",
     "figure_png",
     "format_cell",
     "gallery",

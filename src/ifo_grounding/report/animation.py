@@ -15,17 +15,17 @@ from ifo_grounding.report.theme import BAD, GOOD, RUNNING
 
 COLOURS = 128
 """Colours of an animation; the world has a few dozen."""
+HOLD = 2.5
+"""Seconds for which the end is shown."""
 
 
 def animation(
     episodes: Sequence[Episode],
     *,
     titles: Sequence[str] | None = None,
-    actions: Sequence[str] | None = None,
+    actions: Sequence[str] = keys.ACTIONS,
     columns: int = 4,
     width: int = 200,
-    fps: float = 4.0,
-    hold: float = 2.0,
 ) -> bytes:
     """Return episodes side by side as a GIF that repeats.
 
@@ -35,12 +35,9 @@ def animation(
     Args:
         episodes: what to show, such as :func:`~ifo_grounding.evaluation.record_episodes` returns.
         titles: a word above each, such as ``phase 1``.
-        actions: names of the actions; by default those of the grid, or numbers where it has not as
-            many: name those of another world.
+        actions: names of the actions, by default those of the grid.
         columns: episodes side by side.
         width: about how wide an episode is drawn, in pixels; frames are enlarged without blur.
-        fps: actions per second.
-        hold: seconds for which the end is shown.
 
     Raises:
         UserError: without episodes, or where titles do not match them or actions lack a name.
@@ -56,19 +53,18 @@ def animation(
     if titles is not None and len(titles) != len(episodes):
         raise UserError(f"titles must be one per episode, got {len(titles)} of {len(episodes)}")
     count = 1 + max(int(max(e.actions, default=0)) for e in episodes)
-    names = keys.action_names(max(count, keys.N_ACTIONS)) if actions is None else actions
-    if len(names) < count:
-        raise UserError(f"there are {count} actions and {len(names)} names: name all of them")
+    if len(actions) < count:
+        raise UserError(f"there are {count} actions and {len(actions)} names: name all of them")
     titled = list(zip(episodes, titles or [""] * len(episodes), strict=True))
     pictures = [
         draw_sheet(
-            [_cell(episode, title, step, names) for episode, title in titled],
+            [_cell(episode, title, step, actions) for episode, title in titled],
             columns=columns,
             width=width,
         )
         for step in range(max(len(episode.frames) for episode in episodes))
     ]
-    return gif(pictures, fps, hold)
+    return gif(pictures, fps=4)
 
 
 def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Captioned:
@@ -82,15 +78,15 @@ def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Ca
     return Captioned(frame, episode.sentence, title, note, GOOD if episode.success else BAD)
 
 
-def gif(pictures: Sequence[Image.Image], fps: float, hold: float) -> bytes:
-    """Return pictures of one size as a GIF that repeats, the last one held for some seconds."""
+def gif(pictures: Sequence[Image.Image], fps: float) -> bytes:
+    """Return pictures of one size as a GIF that repeats, the last one held for a while."""
     # One palette, from the first and the last picture, keeps colours from flickering.
     both = Image.new("RGB", (pictures[0].width, 2 * pictures[0].height))
     both.paste(pictures[0], (0, 0))
     both.paste(pictures[-1], (0, pictures[0].height))
     palette = both.quantize(COLOURS, dither=Image.Dither.NONE)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    durations = [round(1000 / fps)] * (len(frames) - 1) + [round(1000 * hold)]
+    durations = [round(1000 / fps)] * (len(frames) - 1) + [round(1000 * HOLD)]
     buffer = io.BytesIO()
     frames[0].save(
         buffer,

@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from ifo_grounding.evaluation.suitability import checked_choices, read_pool
+from ifo_grounding.evaluation.suitability import read_pool, suitable_rate
 from ifo_grounding.report.drawing import Captioned
 from ifo_grounding.report.theme import BAD, GOOD
 from ifo_grounding.tasks.goals import REASONS
@@ -41,15 +41,15 @@ def instruction_cases(
         count: how many cases at most.
         options: of :func:`~ifo_grounding.evaluation.suitable_rate`, such as ``threshold``.
     """
-    found = checked_choices(classifier, task, pool, states=SEARCHED, **options)
+    found = suitable_rate(classifier, task, pool, states=SEARCHED, pairs_per_state=0, **options)
     tokens, _ = read_pool(task, pool)
     wrong = (found.verdict > 0).nonzero().squeeze(-1).tolist()[: count // 3]
     right = (found.verdict == 0).nonzero().squeeze(-1).tolist()[: count - len(wrong)]
     rows = torch.tensor([*right, *wrong], dtype=torch.int64)
     if not len(rows):
         return []
-    pictures = render(found.state[rows], PICTURE_TILE_SIZE).cpu().numpy()
-    sentences = VOCABULARY.decode(tokens[found.chosen[rows].cpu()])
+    pictures = render(found.state[rows], PICTURE_TILE_SIZE).numpy()
+    sentences = VOCABULARY.decode(tokens[found.chosen[rows]])
     cases = []
     for row, picture, sentence in zip(rows.tolist(), pictures, sentences, strict=True):
         verdict = int(found.verdict[row])

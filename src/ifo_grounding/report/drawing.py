@@ -69,12 +69,9 @@ def wrapped(text: str, width: int) -> list[str]:
 
 
 def draw_sheet(cells: Sequence[Captioned], *, columns: int, width: int) -> Image.Image:
-    """Draw captioned pictures of one size in a grid.
+    """Draw captioned pictures of one size in a grid, each about ``width`` pixels wide.
 
-    Args:
-        cells: what to draw; cells with the same captions and titles make sheets of the same size.
-        columns: cells side by side.
-        width: about how wide a picture is drawn, in pixels.
+    Cells with the same captions and titles make sheets of the same size.
     """
     columns = max(1, min(columns, len(cells)))
     lines = max(len(wrapped(cell.caption, width)) for cell in cells)

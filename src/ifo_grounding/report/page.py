@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jinja2 import Environment, PackageLoader
 from matplotlib.figure import Figure
 
@@ -19,11 +18,12 @@ from ifo_grounding.files import atomic_write, write_json
 from ifo_grounding.report.drawing import Captioned, gallery, upscaled
 from ifo_grounding.report.tables import columns_of, format_cell, is_number
 from ifo_grounding.report.theme import figure_png
+from ifo_grounding.stats.results import plain
 
 PIXELS_PER_INCH = 84
 SUFFIXES = {b"\x89PNG": "png", b"GIF8": "gif", b"\xff\xd8\xff": "jpeg"}
-Picture = Figure | bytes | str | Path | np.ndarray | Sequence[Captioned]
-"""A matplotlib figure, an image file or its bytes, pixels uint8 [3, H, W], or captioned ones."""
+Picture = Figure | bytes | Sequence[Captioned]
+"""A matplotlib figure, the bytes of an image file, or frames with captions."""
 
 
 def write_report(
@@ -45,8 +45,8 @@ def write_report(
             (:class:`~ifo_grounding.stats.Rate` and its like) becomes a headline on top; a mapping
             a table of two columns, a list of mappings a table with a column per key, a text a
             paragraph.
-        pictures: by heading: matplotlib figures, image files or bytes, pixels uint8 [3, H, W], or
-            lists of :class:`~ifo_grounding.report.Captioned`.
+        pictures: by heading: matplotlib figures, the bytes of PNGs, GIFs or JPEGs, or lists of
+            :class:`~ifo_grounding.report.Captioned`.
         title: of the page.
         summary: a sentence below the title.
 
@@ -66,9 +66,9 @@ def write_report(
             cards.append({"name": name, **_cell(value)})
         else:
             sections.append({"name": name, **_result(value)})
-    files = _file_names(pictures)
-    for name, picture in pictures.items():
-        sections.append({"name": name, **_picture(picture, folder / "pictures" / files[name])})
+    for number, (name, picture) in enumerate(pictures.items(), 1):
+        file = "-".join([f"{number:02}", *re.findall("[a-z0-9]+", name.lower())])
+        sections.append({"name": name, **_picture(picture, folder / "pictures" / file)})
     # Every text is escaped by the template: instructions and names come from users.
     pages = Environment(
         loader=PackageLoader("ifo_grounding.report", ""),
@@ -84,23 +84,6 @@ def write_report(
     with atomic_write(folder / "index.html") as temporary:
         temporary.write_text(page, encoding="utf-8")
     return folder / "index.html"
-
-
-def plain(value: Any) -> Any:
-    """Return results as values for JSON.
-
-    >>> plain({"shape": torch.tensor([1, 2]), "path": Path("demos")})
-    {'shape': [1, 2], 'path': 'demos'}
-    """
-    if hasattr(value, "as_dict"):
-        return value.as_dict()
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (torch.Tensor, np.ndarray)):
-        return value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def _result(value: Any) -> dict[str, Any]:
@@ -123,49 +106,17 @@ def _cell(value: Any) -> dict[str, Any]:
     return {"number": number, "detail": bracket.strip() + interval, "figure": True}
 
 
-def _file_names(pictures: Mapping[str, Picture]) -> dict[str, str]:
-    """Return the name of each picture's file without its ending, no name twice.
-
-    >>> _file_names({"Step 1": b"", "step: 1": b""})
-    {'Step 1': 'step-1', 'step: 1': 'step-1-2'}
-    """
-    names: dict[str, str] = {}
-    for heading in pictures:
-        slug = re.sub(r"[^a-z0-9]+", "-", heading.lower()).strip("-") or "picture"
-        count, name = 1, slug
-        while name in names.values():
-            count += 1
-            name = f"{slug}-{count}"
-        names[heading] = name
-    return names
-
-
 def _picture(picture: Picture, path: Path) -> dict[str, Any]:
     """Return what the template shows of a picture, and write it into a file without its ending."""
     if isinstance(picture, Figure):
-        content = figure_png(picture)
-        _keep(path, content)
-        width = round(picture.get_figwidth() * PIXELS_PER_INCH)
-        return {"plot": _data(content), "width": width}
-    if isinstance(picture, (list, tuple)):
-        if not picture:
-            return {"text": "None."}
-        _keep(path, gallery(picture))
-        return {"cases": [(case, _data(_png(case.frame))) for case in picture]}
-    content = _image_bytes(picture)  # type: ignore[arg-type]
-    _keep(path, content)
-    return {"image": _data(content)}
-
-
-def _image_bytes(picture: bytes | str | Path | np.ndarray) -> bytes:
+        content = _kept(figure_png(picture), path)
+        return {"plot": content, "width": round(picture.get_figwidth() * PIXELS_PER_INCH)}
     if isinstance(picture, bytes):
-        return picture
-    if isinstance(picture, (str, Path)):
-        try:
-            return Path(picture).read_bytes()
-        except OSError as error:
-            raise UserError(f"cannot read the picture {picture}: {error.strerror}") from None
-    return _png(picture)
+        return {"image": _kept(picture, path)}
+    if not picture:
+        return {"text": "None."}
+    _kept(gallery(picture), path)
+    return {"cases": [(case, _data(_png(case.frame))) for case in picture]}
 
 
 def _png(pixels: np.ndarray) -> bytes:
@@ -185,6 +136,8 @@ def _data(content: bytes) -> str:
     return f"data:image/{_suffix(content)};base64,{base64.b64encode(content).decode()}"
 
 
-def _keep(path: Path, content: bytes) -> None:
+def _kept(content: bytes, path: Path) -> str:
+    """Write an image file, and return it as the page holds it."""
     with atomic_write(path.with_name(f"{path.name}.{_suffix(content)}")) as temporary:
         temporary.write_bytes(content)
+    return _data(content)

@@ -3,154 +3,86 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, PercentFormatter
 from scipy.ndimage import uniform_filter1d
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.report.theme import (
-    FAINT,
-    PALETTE,
-    add_legend,
-    dress,
-    in_percent,
-    new_figure,
-    new_panels,
-)
+from ifo_grounding.report.theme import FAINT, PALETTE, add_legend, dress, in_percent, new_panels
 from ifo_grounding.stats import Rate
 
-SHARES = ("accuracy", "probability", "removed", "share", "stopped", "success", "sampled")
+SHARES = ("accuracy", "auc", "probability", "removed", "sampled", "share", "stopped", "success")
 """Last words of the names of metrics that are shares, and drawn in percent."""
-PANELS: dict[str, dict[str, str]] = {
-    "Learned return and true success": {
-        "audit_return": "learned return",
-        "audit_success": "true success",
-    },
-    "True success": {"success": "greedy", "success_sampled": "sampled"},
-    "Chosen instructions": {"suitable": "suitable", "served_share": "states served"},
-    "Learned rewards against the truth (AUC)": {
-        "return_auc": "return: success above failure",
-        "action_auc": "reward: expert's action above another",
-    },
-    "Episode length": {"episode_length": "steps"},
-    "Entropy of the policy": {"entropy": "nats"},
-}
-"""Panels of the picture: the logged metrics of each, with what they are called there."""
-IN_PERCENT = tuple(PANELS)[:4]
-"""Panels in percent."""
-LABELS_APART = 0.1
-"""Share of an axis that two of its labels keep between them."""
-
-
-def known(history: Sequence[Mapping[str, float | None]], name: str) -> list[tuple[float, float]]:
-    """Return the steps at which a metric is known, and its values there.
-
-    >>> known([{"step": 1, "loss": 2.0}, {"step": 2, "loss": None}, {"step": 3}], "loss")
-    [(1, 2.0)]
-    """
-    rows = [(row["step"], row[name]) for row in history if name in row]
-    return [(x, y) for x, y in rows if x is not None and y is not None and math.isfinite(y)]
 
 
 def training_curves(
-    history: Sequence[Mapping[str, float | None]],
-    names: Sequence[str] | None = None,
+    history: Sequence[Mapping[str, Any]],
+    panels: Sequence[str] | Mapping[str, Mapping[str, str]] | None = None,
 ) -> Figure:
-    """Draw one small plot per metric: every value faintly, their running mean on top.
+    """Draw what was logged, one small plot per metric or per group of them.
 
-    The mean is over a fiftieth of the values.
+    Of many values, their running mean over a fiftieth of them is drawn on top.
 
     Args:
         history: what was logged, as :func:`~ifo_grounding.training.fit` returns it: a row per
-            step with ``step`` and metrics. Values that are None or not finite are left out.
-        names: which metrics, in which order; all where None.
+            step with ``step`` and metrics. Values that are None or not finite are left out, and
+            so are metrics without any.
+        panels: which metrics, in which order, or {title: {metric: label}}; all metrics where None.
 
     Raises:
-        UserError: where a name was not logged.
+        UserError: where none of the metrics was logged.
 
     >>> figure = training_curves([{"step": step, "loss": 3.0 - step} for step in range(3)])
     >>> figure.axes[0].get_title(loc="left")
     'loss'
     """
     logged = [name for name in dict.fromkeys(n for row in history for n in row) if name != "step"]
-    chosen = logged if names is None else list(names)
-    series = {name: known(history, name) for name in chosen}
-    missing = [name for name in chosen if name not in logged]
-    if missing or not chosen:
-        raise UserError(f"no metric {missing or ''}: logged were {', '.join(logged) or 'none'}")
-    figure, panels = new_panels(len(chosen), 4.2, 2.5)
-    for axes, (name, points) in zip(panels, series.items(), strict=True):
-        _curve(axes, name, points)
-    return figure
-
-
-def _curve(axes: Axes, name: str, points: Sequence[tuple[float, float]]) -> None:
-    dress(axes, name, "step")
-    if not points:
-        return
-    span = max(1, len(points) // 50)
-    steps, values = zip(*points, strict=True)
-    if span > 1:
-        axes.plot(steps, values, color=PALETTE[4], alpha=0.45, linewidth=0.8)
-    marker = "o" if len(values) <= 30 else ""
-    mean = uniform_filter1d(np.asarray(values), span, mode="nearest")
-    axes.plot(steps, mean, color=PALETTE[0], linewidth=1.8, marker=marker, ms=3.5)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
-    if name.rpartition("_")[2] in SHARES and max(values) > 0.1:
-        in_percent(axes)
-
-
-def audit_figure(history: Sequence[Mapping[str, float]]) -> Figure:
-    """Draw the audit of a self-examination.
-
-    Reward hacking shows in the first panel: the learned return rises, and true success does not.
-    Both are measured on the same rollouts of scenes with true instructions.
-
-    Args:
-        history: what ``self_examine`` returned, with the metrics of the recipes' audit; metrics
-            that an iteration lacks are left out, as are those that are not defined there (an AUC
-            where every episode succeeds).
-
-    Raises:
-        UserError: where the history holds none of the metrics of the picture.
-
-    >>> rows = [{"step": 1.0, "entropy": 0.5}, {"step": 2.0, "entropy": 0.4, "success": 0.9}]
-    >>> [axes.get_title(loc="left") for axes in audit_figure(rows).axes if axes.get_visible()]
-    ['True success', 'Entropy of the policy']
-    """
-    points = {name: known(history, name) for lines in PANELS.values() for name in lines}
-    panels = [
-        (title, {label: points[name] for name, label in lines.items() if points[name]})
-        for title, lines in PANELS.items()
-    ]
-    panels = [(title, lines) for title, lines in panels if lines]
-    if not panels:
-        raise UserError("the history holds nothing to audit: was it a self-examination?")
-    figure, grid = new_panels(len(panels), 4.4, 2.6)
-    for axes, (title, lines) in zip(grid, panels, strict=True):
-        _panel(axes, title, lines)
+    if not isinstance(panels, Mapping):
+        panels = {name: {name: name} for name in (logged if panels is None else panels)}
+    points = {
+        name: [
+            (row["step"], row[name])
+            for row in history
+            if row.get(name) is not None and math.isfinite(row[name])
+        ]
+        for names in panels.values()
+        for name in names
+    }
+    shown = {
+        title: {name: label for name, label in names.items() if points[name]}
+        for title, names in panels.items()
+        if any(points[name] for name in names)
+    }
+    if not shown:
+        raise UserError(f"no metric of {list(points)}: logged were {', '.join(logged) or 'none'}")
+    figure, grid = new_panels(len(shown), 4.3, 2.5)
+    for axes, (title, names) in zip(grid, shown.items(), strict=True):
+        _panel(axes, title, {label: points[name] for name, label in names.items()})
         axes.set_xlim(history[0]["step"] - 0.5, history[-1]["step"] + 0.5)
+        top = max(value for name in names for _, value in points[name])
+        if top > 0.1 and any(name.rpartition("_")[2] in SHARES for name in names):
+            low, top = max(0.0, min(axes.get_ylim()[0], 0.9)), max(1.0, top)  # as returns can be
+            in_percent(axes, low, top + 0.05 * (top - low))
     return figure
 
 
-def _panel(axes: Axes, title: str, lines: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+def _panel(axes: Axes, title: str, lines: Mapping[str, list[tuple[float, float]]]) -> None:
     """Draw one panel: the points of each line, by label."""
-    dress(axes, title, "iteration")
+    dress(axes, title, "step")
     for (label, points), colour in zip(lines.items(), PALETTE, strict=False):
+        steps, values = zip(*points, strict=True)
+        span = max(1, len(points) // 50)
+        if span > 1:
+            axes.plot(steps, values, color=colour, alpha=0.3, linewidth=0.8)
+        mean = uniform_filter1d(np.asarray(values, np.float64), span, mode="nearest")
         marker = "o" if len(points) <= 30 else ""
-        style: dict[str, Any] = {"linewidth": 1.8, "marker": marker, "ms": 3.5}
-        axes.plot(*zip(*points, strict=True), color=colour, label=label, **style)
+        axes.plot(steps, mean, color=colour, label=label, linewidth=1.8, marker=marker, ms=3.5)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
-    if title in IN_PERCENT:
-        low = min(axes.get_ylim()[0], 0.9)
-        top = max(1.0, *(value for points in lines.values() for _, value in points))
-        in_percent(axes, low)
-        axes.set_ylim(top=top + 0.05 * (top - low))  # a return can exceed 1
     if len(lines) > 1:
         add_legend(axes, loc="best")
 
@@ -179,6 +111,7 @@ def rates_by_number(
     numbers = sorted({number for curve in every for number in curve})
     lines = [rate for panel in (references or {}).values() for rate in panel.values()]
     low = min([*lines, *(rate.low for curve in every for rate in curve.values())])
+    legend: dict[str, Any] = {}
     figure, grid = new_panels(len(panels), 3.2, 3.0, columns=3)
     for axes, (title, curves) in zip(grid, panels.items(), strict=True):
         dress(axes, title, "demonstrations")
@@ -190,34 +123,16 @@ def rates_by_number(
             _with_intervals(axes, points, PALETTE[place % len(PALETTE)], name)
         for name, rate in (references or {}).get(title, {}).items():
             axes.axhline(rate, color=FAINT, linestyle="--", linewidth=1.2, label=name)
-        axes.set_xticks(numbers, _labels(numbers))
         axes.set_xlim(0.8 * numbers[0], 1.25 * numbers[-1])
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.minorticks_off()
         in_percent(axes, max(0.0, 0.1 * math.floor(10 * low)))
-    _shared_legend(figure, grid)
-    return figure
-
-
-def _shared_legend(figure: Figure, panels: Iterable[Axes]) -> None:
-    """Add one legend below for all panels."""
-    shown: dict[str, Any] = {}
-    for axes in panels:
         handles, labels = axes.get_legend_handles_labels()
-        shown |= dict(zip(labels, handles, strict=True))
-    style = {"loc": "outside lower center", "ncols": len(shown)}
-    add_legend(figure, handles=list(shown.values()), labels=list(shown), **style)
-
-
-def _labels(numbers: Sequence[int]) -> list[str]:
-    """Label numbers as 500 or 2K, but none so near to the last label that they would touch."""
-    apart = (numbers[-1] / numbers[0]) ** LABELS_APART
-    labels, last = [], 0.0
-    for number in numbers:
-        fits = number >= apart * last
-        short = f"{number / 1000:g}K" if number >= 1000 else str(number)
-        labels.append(short if fits else "")
-        last = number if fits else last
-    return labels
+        legend |= dict(zip(labels, handles, strict=True))
+    style = {"loc": "outside lower center", "ncols": len(legend)}
+    add_legend(figure, handles=list(legend.values()), labels=list(legend), **style)
+    return figure
 
 
 def _with_intervals(
@@ -238,24 +153,20 @@ def _with_intervals(
     )
 
 
-def reliability_diagram(bins: Sequence[tuple[float, Rate]], *, title: str = "") -> Figure:
+def reliability_diagram(bins: Sequence[tuple[float, Rate]]) -> Figure:
     """Draw how often something was true against its predicted probability, with intervals.
 
     Numbers at the points count predictions; on the diagonal predictions are calibrated.
 
     Args:
         bins: as :func:`ifo_grounding.stats.reliability` returns them.
-        title: above the plot.
 
     >>> from ifo_grounding.stats import reliability
     >>> reliability_diagram(reliability([0.2, 0.8, 0.9], [0, 1, 1])).axes[0].get_xlabel()
     'predicted'
     """
-    if not bins:
-        raise UserError("a reliability diagram needs at least one bin")
-    figure, grid = new_figure(4.4, 4.0)
-    axes = grid[0, 0]
-    dress(axes, title, "predicted", "true", grid="both")
+    figure, (axes,) = new_panels(1, 4.0, 3.8)
+    dress(axes, "", "predicted", "true", grid="both")
     axes.plot([0, 1], [0, 1], color=FAINT, linestyle="--", linewidth=1.2)
     _with_intervals(axes, bins, PALETTE[0])
     for place, rate in bins:

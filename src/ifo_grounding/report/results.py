@@ -29,10 +29,8 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
             out.
 
     >>> from ifo_grounding.stats import wilson
-    >>> rows = results_rows({"labels": {"rate": wilson(9, 10).as_dict(), "worst": "P",
-    ...     "per_action": {"P": wilson(1, 2).as_dict()}}})
-    >>> [row["measured"] for row in rows]
-    ['inverse accuracy', 'inverse accuracy, worst action (P)']
+    >>> results_rows({"suitability": {"served": wilson(9, 10).as_dict()}})[0]["measured"]
+    'states served'
     """
     return [
         {"measured": measured, "result [95% interval]": restored(kind, values)}
@@ -50,8 +48,8 @@ def _measurements(results: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     for phase in (1, 2):
         if success := results.get(f"phase{phase}"):
             yield f"phase {phase} success, {success['mode']}", Rate, success["rate"]
-            sampled = success.get("sampled", {}).get("rate")
-            yield f"phase {phase} success, sampled", Rate, sampled
+            sampled = success.get("sampled") or {}
+            yield f"phase {phase} success, sampled", Rate, sampled.get("rate")
     yield "phase 2 - phase 1, paired, points", Difference, results.get("gain")
     for name, title in COMPARED.items():
         yield title, Rate, results.get(name, {}).get("rate")
@@ -95,13 +93,10 @@ def brief(value: Measured) -> str:
     return str(value).rpartition(" (")[0].replace(" points", "")
 
 
-def packed(outcomes: Tensor) -> str:
-    """Return the success of each scene, bool [N], as hexadecimal digits of four scenes each."""
-    return np.packbits(outcomes.numpy()).tobytes().hex()
-
-
 def by_scene(outcomes: Tensor) -> dict[str, Any]:
     """Return the rate of success and the success of each scene, bool [N], as plain values.
+
+    Scenes are hexadecimal digits of four each.
 
     >>> import torch
     >>> found = by_scene(torch.tensor([True, False, True]))
@@ -109,7 +104,7 @@ def by_scene(outcomes: Tensor) -> dict[str, Any]:
     (2, 'a0')
     """
     rate = wilson(int(outcomes.sum()), len(outcomes))
-    return {"rate": rate.as_dict(), "outcomes": packed(outcomes)}
+    return {"rate": rate.as_dict(), "outcomes": np.packbits(outcomes.numpy()).tobytes().hex()}
 
 
 def unpacked(runs: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
@@ -120,8 +115,8 @@ def unpacked(runs: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
         name: of the policy in their results.
 
     >>> import torch
-    >>> bits = packed(torch.tensor([True, False, True]))
-    >>> unpacked([{"results": {"phase1": {"outcomes": bits, "rate": {"count": 3}}}}], "phase1")
+    >>> found = by_scene(torch.tensor([True, False, True]))
+    >>> unpacked([{"results": {"phase1": found}}], "phase1")
     array([[ True, False,  True]])
     """
     rows = []

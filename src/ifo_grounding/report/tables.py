@@ -50,13 +50,12 @@ def _aligned_right(rows: Sequence[Row], name: str) -> bool:
     return all(is_number(row.get(name)) for row in rows)
 
 
-def text_table(rows: Sequence[Row], *, title: str | None = None) -> str:
+def text_table(rows: Sequence[Row]) -> str:
     """Return a table for the terminal.
 
     Args:
         rows: what each column says, per row; a :class:`~ifo_grounding.stats.Rate` and its like
             are written with their intervals.
-        title: a line above.
 
     >>> print(text_table([{"task": "move", "share": 0.5}, {"task": "pick-out", "share": 0.25}]))
     task      share
@@ -71,8 +70,7 @@ def text_table(rows: Sequence[Row], *, title: str | None = None) -> str:
         cells.insert(1, "-" * width)
         right = _aligned_right(rows, name)
         columns.append([cell.rjust(width) if right else cell.ljust(width) for cell in cells])
-    lines = ["  ".join(cells).rstrip() for cells in zip(*columns, strict=True)]
-    return "\n".join([title, *lines] if title else lines)
+    return "\n".join("  ".join(cells).rstrip() for cells in zip(*columns, strict=True))
 
 
 def markdown_table(rows: Sequence[Row]) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -22,22 +21,16 @@ GOOD, BAD, RUNNING = "#009E73", "#D55E00", "#B6BEC7"
 PAPER, INK, FAINT, GRID = "#FFFFFF", "#1F2328", "#59636E", "#E4E7EB"
 
 
-def new_figure(
-    width: float, height: float, rows: int = 1, columns: int = 1
-) -> tuple[Figure, np.ndarray]:
-    """Return a figure of some inches and its axes, [rows, columns]."""
-    figure = Figure(figsize=(width, height), facecolor=PAPER, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
 def new_panels(
     count: int, width: float, height: float, columns: int = 2
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure and its axes, each of some inches, so many side by side."""
     columns = min(columns, count)
     rows = -(-count // columns)
-    figure, grid = new_figure(width * columns + 0.4, height * rows + 0.2, rows, columns)
+    size = (width * columns + 0.4, height * rows + 0.2)
+    figure = Figure(figsize=size, facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[count:]:
         axes.set_visible(False)
     return figure, list(grid.flat[:count])
@@ -57,9 +50,9 @@ def dress(axes: Axes, title: str = "", x: str = "", y: str = "", grid: str = "y"
     axes.set_axisbelow(True)
 
 
-def in_percent(axes: Axes, low: float = 0.0) -> None:
-    """Show shares from ``low`` to 1 on the vertical axis as percentages."""
-    axes.set_ylim(low, 1.02)
+def in_percent(axes: Axes, low: float = 0.0, top: float = 1.02) -> None:
+    """Show shares on the vertical axis as percentages."""
+    axes.set_ylim(low, top)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
 
 
@@ -74,14 +67,13 @@ def without_formulas(figure: Figure) -> None:
         text.set_parse_math(False)
 
 
-def figure_png(figure: Figure, *, dpi: int = 150) -> bytes:
+def figure_png(figure: Figure) -> bytes:
     """Return a figure as PNG.
 
-    >>> figure, _ = new_figure(2.0, 1.0)
-    >>> figure_png(figure)[1:4]
+    >>> figure_png(new_panels(1, 2.0, 1.0)[0])[1:4]
     b'PNG'
     """
     without_formulas(figure)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    figure.savefig(buffer, format="png", dpi=150)
     return buffer.getvalue()

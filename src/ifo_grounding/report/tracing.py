@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.container import BarContainer
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from PIL import Image
 
 from ifo_grounding import keys
@@ -24,24 +25,19 @@ from ifo_grounding.report.theme import (
     RUNNING,
     add_legend,
     dress,
-    new_figure,
+    new_panels,
     without_formulas,
 )
 
 MAPS = 8
 """Maps that are shown: the sharpest ones."""
+STEPS = 30
+"""Steps that are shown at most: the last ones."""
 SENTENCE_WIDTH = 70
 """Letters of the instruction on one line."""
 
 
-def trace_animation(
-    trace: Trace,
-    *,
-    actions: Sequence[str] | None = None,
-    steps: int = 30,
-    fps: float = 1.5,
-    hold: float = 3.0,
-) -> bytes:
+def trace_animation(trace: Trace, *, actions: Sequence[str] = keys.ACTIONS) -> bytes:
     """Return a GIF of an episode, step by step.
 
     Each picture has what the policy sees, the instruction, the probability of each action, the
@@ -49,23 +45,17 @@ def trace_animation(
 
     Args:
         trace: from :func:`~ifo_grounding.evaluation.trace_episode`.
-        actions: names of the actions; those of the grid by default, or numbers where there are
-            more or fewer.
-        steps: how many are shown at most, the last ones.
-        fps: steps per second.
-        hold: seconds for which the last step is shown.
+        actions: names of the actions, by default those of the grid.
 
     Raises:
         UserError: where there is not one name for each action.
     """
     count = trace.probabilities.shape[-1]
-    if actions is None:
-        actions = keys.action_names(count)
     if len(actions) != count:
         raise UserError(f"there are {count} actions and {len(actions)} names: name each of them")
     board = _Board(trace, sharpest(trace.maps, MAPS), actions)
     end = len(trace.maps)
-    return gif([board.picture(step) for step in range(max(0, end - steps), end)], fps, hold)
+    return gif([board.picture(step) for step in range(max(0, end - STEPS), end)], fps=1.5)
 
 
 def sharpest(maps: np.ndarray, count: int) -> np.ndarray:
@@ -81,18 +71,19 @@ def sharpest(maps: np.ndarray, count: int) -> np.ndarray:
 
 
 class _Board:
-    """A figure that is laid out once and then shows step after step."""
+    """A figure that is laid out once; of each step only what changes is drawn."""
 
     def __init__(self, trace: Trace, maps: np.ndarray, actions: Sequence[str]) -> None:
         self.trace, self.chosen, self.names = trace, maps, actions
-        self.figure, _ = new_figure(7.6, 5.4)
+        self.figure, _ = new_panels(1, 7.2, 5.2)
         self.figure.clear()
         sentence = textwrap.fill(trace.episode.sentence, SENTENCE_WIDTH)
         self.figure.suptitle(sentence, fontsize=12, fontweight="bold", color=INK)
         rows = self.figure.add_gridspec(2, 1, height_ratios=(3, 1.15))
         top = rows[0].subgridspec(1, 3 if trace.rewards else 2)
-        self.seen = self.figure.add_subplot(top[0])
-        self.frames = [self._frame(self.seen)]
+        seen = self.figure.add_subplot(top[0])
+        dress(seen, "Step", grid="")
+        self.frames = [self._frame(seen)]
         self.bars = self._actions(self.figure.add_subplot(top[1]))
         self.lines = self._rewards(self.figure.add_subplot(top[2])) if trace.rewards else []
         below = rows[1].subgridspec(1, max(len(maps), 1))
@@ -101,6 +92,14 @@ class _Board:
             for place, number in enumerate(maps)
         ]
         without_formulas(self.figure)
+        (self.title,) = (text for text in seen.findobj(Text) if text.get_text() == "Step")
+        self.changing = [*self.frames, *self.weights, *self.bars, *self.lines, self.title]
+        for artist in self.changing:
+            artist.set_animated(True)
+        canvas = self.figure.canvas
+        assert isinstance(canvas, FigureCanvasAgg)
+        canvas.draw()
+        self.canvas, self.still = canvas, canvas.copy_from_bbox(self.figure.bbox)
 
     def _frame(self, axes: Axes, alpha: float = 1.0) -> AxesImage:
         frame = self.trace.episode.frames[0]
@@ -140,7 +139,7 @@ class _Board:
         ended = step == len(episode.actions) - 1
         ending = f", {'success' if episode.success else 'failure'}" if ended else ""
         action = int(episode.actions[step])
-        dress(self.seen, f"Step {step + 1}: {self.names[action]}{ending}", grid="")
+        self.title.set_text(f"Step {step + 1}: {self.names[action]}{ending}")
         for image in self.frames:
             image.set_data(episode.frames[step].transpose(1, 2, 0))
         for number, bar in enumerate(self.bars):
@@ -153,8 +152,7 @@ class _Board:
             shown = np.sqrt(self.trace.maps[step, number])
             image.set_data(shown)
             image.set_alpha(0.8 * shown)
-        canvas = self.figure.canvas
-        assert isinstance(canvas, FigureCanvasAgg)
-        canvas.draw()
-        self.figure.set_layout_engine("none")  # to lay it out once is enough
-        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+        self.canvas.restore_region(self.still)
+        for artist in self.changing:
+            self.figure.draw_artist(artist)
+        return Image.fromarray(np.asarray(self.canvas.buffer_rgba())[..., :3])

@@ -1,10 +1,6 @@
-"""Rates, differences and areas under the ROC curve, each with its 95% interval.
+"""Rates, differences and areas under the ROC curve, each with its 95% interval."""
 
-Numbers go in and out as numpy arrays or anything that becomes one. Everything that resamples is a
-function of its ``seed``.
-"""
-
-from ifo_grounding.stats.association import auc, correlation
+from ifo_grounding.stats.association import auc
 from ifo_grounding.stats.rates import (
     holm,
     paired_difference,
@@ -20,7 +16,6 @@ __all__ = [
     "Estimate",
     "Rate",
     "auc",
-    "correlation",
     "holm",
     "paired_difference",
     "reliability",

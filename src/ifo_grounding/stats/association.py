@@ -1,12 +1,11 @@
-"""How well one number tells another: areas under the ROC curve and correlations."""
+"""How well a score tells positives from negatives: the area under the ROC curve."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import optimize
 from scipy import stats as scipy_stats
 
@@ -20,10 +19,9 @@ Z = float(scipy_stats.norm.ppf(0.5 + CONFIDENCE / 2))
 def auc(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike | None = None) -> Estimate:
     """Return the probability that a positive scores above a negative, ties counting half.
 
-    The interval is DeLong's (1988); where groups are given (scores from one demonstration belong
-    together) Obuchowski's (1997) for clustered data. Both are too narrow near 0 and 1 and where one
-    kind has few scores, so that the interval also covers Newcombe's (2006, method 5) for as many
-    scores as there are groups, which inverts the variance of Hanley and McNeil.
+    The interval is Newcombe's (2006, method 5), which inverts the variance of Hanley and McNeil.
+    Where groups are given (scores from one demonstration belong together) it is that of as many
+    scores as there are groups.
 
     Args:
         scores: high where positive, [N].
@@ -47,20 +45,14 @@ def auc(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike | None = None)
         raise UserError("scores must be finite: the model gave nan or inf")
     if of.all() or not of.any():
         return Estimate(math.nan, 0.0, 1.0, len(every), "area under the ROC curve")
-    # A score's rank among all, less its rank among its own kind, counts those it beats.
-    ranks = scipy_stats.rankdata(every)
-    wins = (ranks[of] - scipy_stats.rankdata(every[of])) / (~of).sum()
-    losses = 1 - (ranks[~of] - scipy_stats.rankdata(every[~of])) / of.sum()
-    value = float(wins.mean())
-    error = _clustered_error(wins - value, losses - value, group[of], group[~of])
+    positives, negatives = int(of.sum()), int((~of).sum())
+    wins = scipy_stats.rankdata(every)[of].sum() - positives * (positives + 1) / 2
+    value = float(wins / (positives * negatives))
     sizes = len(np.unique(group[of])), len(np.unique(group[~of]))
+    low, high = _limit(value, 0.0, *sizes), _limit(value, 1.0, *sizes)
     by_groups = "" if groups is None else " by groups"
     return Estimate(
-        value,
-        low=min(max(0.0, value - Z * error), _limit(value, 0.0, *sizes)),
-        high=max(min(1.0, value + Z * error), _limit(value, 1.0, *sizes)),
-        count=len(every),
-        method=f"area under the ROC curve, DeLong and Newcombe{by_groups}",
+        value, low, high, len(every), f"area under the ROC curve, Newcombe interval{by_groups}"
     )
 
 
@@ -77,41 +69,3 @@ def _limit(value: float, end: float, m: int, n: int) -> float:
         return end
     beside = value + (end - value) * 1e-9  # at 0 and 1 there is no error, and another root
     return float(optimize.brentq(excess, beside, end))
-
-
-def _clustered_error(
-    x: NDArray[np.float64], y: NDArray[np.float64], gx: NDArray[Any], gy: NDArray[Any]
-) -> float:
-    """Standard error of an area from the centred placements of groups."""
-    names, index = np.unique(np.concatenate([gx, gy]), return_inverse=True)
-    sum_x = np.bincount(index[: len(x)], weights=x, minlength=len(names)) / len(x)
-    sum_y = np.bincount(index[len(x) :], weights=y, minlength=len(names)) / len(y)
-
-    def unbiased(groups: int) -> float:
-        return groups / max(groups - 1, 1)
-
-    variance = unbiased(len(np.unique(gx))) * (sum_x**2).sum()
-    variance += unbiased(len(np.unique(gy))) * (sum_y**2).sum()
-    variance += 2 * unbiased(len(names)) * (sum_x * sum_y).sum()
-    return math.sqrt(max(0.0, float(variance)))
-
-
-def correlation(first: ArrayLike, second: ArrayLike) -> Estimate:
-    """Return Pearson's correlation (point-biserial where one is a success) and Fisher's interval.
-
-    It is undefined where either does not vary.
-
-    >>> round(correlation([0, 1, 0, 1], [1.0, 2.0, 1.0, 2.0]).value, 6)
-    1.0
-    """
-    x, y = np.asarray(first, np.float64).ravel(), np.asarray(second, np.float64).ravel()
-    if len(x) != len(y):
-        raise UserError(f"correlation needs pairs, got {len(x)} and {len(y)} values")
-    method = "Pearson correlation, Fisher interval"
-    if len(x) < 4 or np.ptp(x) == 0 or np.ptp(y) == 0:
-        return Estimate(math.nan, -1.0, 1.0, len(x), method)
-    found = scipy_stats.pearsonr(x, y)
-    interval = found.confidence_interval(CONFIDENCE)
-    return Estimate(
-        float(found.statistic), float(interval.low), float(interval.high), len(x), method
-    )

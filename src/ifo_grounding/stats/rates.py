@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, binomtest, t
 
-from ifo_grounding.errors import UserError, at_least_one
+from ifo_grounding.errors import UserError
 from ifo_grounding.stats.results import CONFIDENCE, Difference, Rate
 
 RESAMPLES = 4000
-"""Bootstrap replicates unless told otherwise: bounds are stable to about a tenth of a width."""
+"""Bootstrap replicates: bounds are stable to about a tenth of a width."""
 TAIL = (1 - CONFIDENCE) / 2
 FEW_CHANGES = 10
 """Scenes that changed, below which a bootstrap of differences is not trusted alone."""
+BINS = 10
+"""Of a reliability diagram."""
 
 
 def wilson(successes: int, count: int) -> Rate:
@@ -33,75 +34,58 @@ def wilson(successes: int, count: int) -> Rate:
     successes, count = int(successes), int(count)
     if count == 0:
         return Rate(math.nan, 0.0, 1.0, 0, 0, "wilson")
-    found = binomtest(successes, count)
-    interval = found.proportion_ci(CONFIDENCE, method="wilson")
-    low, high = float(interval.low), float(interval.high)
-    return Rate(successes / count, low, high, successes, count, "wilson")
+    low, high = binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
+    return Rate(successes / count, float(low), float(high), successes, count, "wilson")
 
 
-def reliability(
-    probabilities: ArrayLike, happened: ArrayLike, bins: int = 10
-) -> list[tuple[float, Rate]]:
-    """Compare probabilities with what happened, in bins of equal width (DeGroot, Fienberg 1983).
+def reliability(probabilities: ArrayLike, happened: ArrayLike) -> list[tuple[float, Rate]]:
+    """Compare probabilities with what happened, in ten bins of equal width.
 
     Args:
         probabilities: what was predicted, in [0, 1], [N].
         happened: what came true, bool [N].
-        bins: number of bins.
 
     Returns:
         For each bin that is not empty the mean probability and the share of what came true, with
-        Wilson's interval. The closer the two, the better calibrated.
+        Wilson's interval. The closer the two, the better calibrated (DeGroot and Fienberg 1983).
 
-    Raises:
-        UserError: where the inputs do not fit together, or are no probabilities.
-
-    >>> [(said, rate.rate) for said, rate in reliability([0.25, 0.25, 0.75], [0, 1, 1], bins=2)]
+    >>> [(said, rate.rate) for said, rate in reliability([0.25, 0.25, 0.75], [0, 1, 1])]
     [(0.25, 0.5), (0.75, 1.0)]
     """
     said = np.asarray(probabilities, dtype=np.float64).ravel()
     true = np.asarray(happened, dtype=bool).ravel()
-    if len(said) != len(true):
-        raise UserError(f"{len(said)} probabilities do not fit {len(true)} outcomes")
-    bins = at_least_one("bins", bins)
-    if not ((said >= 0) & (said <= 1)).all():
-        raise UserError("probabilities must lie in [0, 1]")
-    places = np.minimum((said * bins).astype(int), bins - 1)
+    if len(said) != len(true) or not ((said >= 0) & (said <= 1)).all():
+        raise UserError("reliability needs probabilities within 0..1, and as many outcomes")
+    places = np.minimum((said * BINS).astype(int), BINS - 1)
     return [
         (float(said[here].mean()), wilson(int(true[here].sum()), int(here.sum())))
-        for here in (places == place for place in range(bins))
-        if here.any()
+        for here in (places == place for place in np.unique(places))
     ]
 
 
-def _resampled_means(
-    values: NDArray[np.float64], resamples: int, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    """Means of resampled [seeds, scenes] values: seeds first, then scenes.
+def _bootstrap_bounds(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a percentile interval of the mean of [seeds, scenes]: seeds are drawn, then scenes.
 
     Scenes in which every seed came out alike are drawn by their number, which is the same as one by
     one and takes hardly longer for many scenes than for few.
     """
     seeds, scenes = values.shape
-    seed = rng.integers(seeds, size=(resamples, seeds))
+    rng = np.random.default_rng(0)
+    seed = rng.integers(seeds, size=(RESAMPLES, seeds))
     patterns, counts = np.unique(values, axis=1, return_counts=True)
-    drawn = rng.multinomial(scenes, counts / scenes, size=resamples)
+    drawn = rng.multinomial(scenes, counts / scenes, size=RESAMPLES)
     by_seed = drawn @ patterns.T / scenes
-    return np.take_along_axis(by_seed, seed, axis=1).mean(1)
+    return np.quantile(np.take_along_axis(by_seed, seed, axis=1).mean(1), (TAIL, 1 - TAIL))
 
 
 def _as_matrix(outcomes: ArrayLike, name: str) -> NDArray[np.float64]:
-    values = np.asarray(outcomes, dtype=np.float64)
-    if values.ndim == 1:
-        values = values[None]
-    if values.ndim != 2 or not values.size:
-        raise UserError(f"{name} must be [scenes] or [seeds, scenes], got {list(values.shape)}")
-    if not np.isin(values, (0.0, 1.0)).all():
-        raise UserError(f"{name} must be successes and failures (True or False, 1 or 0)")
+    values = np.atleast_2d(np.asarray(outcomes, dtype=np.float64))
+    if values.ndim != 2 or not values.size or not np.isin(values, (0.0, 1.0)).all():
+        raise UserError(f"{name} must be True or False, 1 or 0, [scenes] or [seeds, scenes]")
     return values
 
 
-def two_level_bootstrap(outcomes: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0) -> Rate:
+def two_level_bootstrap(outcomes: ArrayLike) -> Rate:
     """Return the mean success over training seeds, with an interval that counts their spread.
 
     Each replicate draws seeds with replacement, then scenes, the same for every seed. The interval
@@ -112,18 +96,14 @@ def two_level_bootstrap(outcomes: ArrayLike, *, resamples: int = RESAMPLES, seed
     Args:
         outcomes: successes, bool [seeds, scenes], column j the same scene for every seed; [scenes]
             is one seed.
-        resamples: number of replicates.
-        seed: of the resampling.
 
     >>> print(two_level_bootstrap([[1, 1, 0, 1], [1, 0, 0, 1]]).rate)
     0.625
     """
-    at_least_one("resamples", resamples)
     values = _as_matrix(outcomes, "outcomes")
-    means = _resampled_means(values, resamples, np.random.default_rng(seed))
     different = values.shape[1] if np.ptp(values) == 0 else values.size
     least = wilson(round(different * float(values.mean())), different)
-    low, high = np.quantile(means, (TAIL, 1 - TAIL))
+    low, high = _bootstrap_bounds(values)
     return Rate(
         rate=float(values.mean()),
         low=min(float(low), least.low),
@@ -134,9 +114,7 @@ def two_level_bootstrap(outcomes: ArrayLike, *, resamples: int = RESAMPLES, seed
     )
 
 
-def paired_difference(
-    before: ArrayLike, after: ArrayLike, *, resamples: int = RESAMPLES, seed: int = 0
-) -> Difference:
+def paired_difference(before: ArrayLike, after: ArrayLike) -> Difference:
     """Compare two policies on the same scenes.
 
     The interval comes from the two-level bootstrap. Where all but fewer than ten scenes fared
@@ -151,8 +129,6 @@ def paired_difference(
     Args:
         before: successes of the first policy, bool [scenes] or [seeds, scenes].
         after: successes of the second on the same scenes, same shape.
-        resamples: number of replicates.
-        seed: of the resampling.
 
     Raises:
         UserError: where the shapes differ.
@@ -161,7 +137,6 @@ def paired_difference(
     >>> difference.points, difference.better, difference.worse, difference.p_value
     (25.0, 1, 0, 1.0)
     """
-    at_least_one("resamples", resamples)
     first, second = _as_matrix(before, "before"), _as_matrix(after, "after")
     if first.shape != second.shape:
         raise UserError(
@@ -171,9 +146,7 @@ def paired_difference(
     change = second - first
     seeds = len(change)
     better, worse = int((change > 0).sum()), int((change < 0).sum())
-    means = _resampled_means(change, resamples, np.random.default_rng(seed))
-    bootstrap = np.quantile(means, (TAIL, 1 - TAIL))
-    exact = _exact_bounds(better, worse, *change.shape)
+    bounds = [*_bootstrap_bounds(change), *_exact_bounds(better, worse, *change.shape)]
     if seeds == 1:
         p_value = float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
         method = "bootstrap over scenes, exact McNemar test"
@@ -182,8 +155,8 @@ def paired_difference(
         method = f"bootstrap over {seeds} seeds and their scenes, t test over seeds"
     return Difference(
         points=100 * float(change.mean()),
-        low=100 * float(min([bootstrap[0], *exact])),
-        high=100 * float(max([bootstrap[1], *exact])),
+        low=100 * float(min(bounds)),
+        high=100 * float(max(bounds)),
         better=better,
         worse=worse,
         count=change.size,
@@ -239,7 +212,7 @@ def _t_test(change: NDArray[np.float64]) -> float:
     return float(2 * t.sf(abs(change.mean()) / error, seeds - 1))
 
 
-def holm(p_values: Sequence[float] | ArrayLike) -> list[float]:
+def holm(p_values: ArrayLike) -> list[float]:
     """Adjust p-values for their number (Holm 1979), in the given order.
 
     >>> holm([0.01, 0.04, 0.03])
@@ -249,7 +222,5 @@ def holm(p_values: Sequence[float] | ArrayLike) -> list[float]:
     if p.ndim != 1 or not ((p >= 0) & (p <= 1)).all():
         raise UserError("p_values must be a list of numbers within 0..1")
     order = np.argsort(p, kind="stable")
-    adjusted = np.empty_like(p)
     steps = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
-    adjusted[order] = np.minimum(steps, 1.0)
-    return [float(value) for value in adjusted]
+    return np.minimum(steps, 1.0)[np.argsort(order)].tolist()

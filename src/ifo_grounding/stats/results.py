@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -11,12 +12,7 @@ CONFIDENCE = 0.95
 
 
 def _digits(rate: float, width: float) -> int:
-    """Decimals of a percentage that round away neither a rare failure or success nor its interval.
-
-    Args:
-        rate: a share.
-        width: of its interval, a share too.
-    """
+    """Decimals that round away neither a rare failure or success nor its interval's width."""
     rare = min(rate, 1.0 - rate)
     if not rare:
         return 1 if width >= 0.0005 else 2 if width >= 0.00005 else 3
@@ -35,21 +31,31 @@ class Described:
         True
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        return {k: _plain(v) for k, v in values.items() if not hasattr(v, "shape")}
+        return {k: plain(v) for k, v in values.items() if not hasattr(v, "shape")}
 
     def __str__(self) -> str:
         """Return the headline with its interval."""
         return str(getattr(self, fields(self)[0].name))  # type: ignore[arg-type]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return results as values for JSON.
+
+    >>> from pathlib import Path
+    >>> plain({"none": math.nan, "pair": (1, 2), "path": Path("demos")})
+    {'none': None, 'pair': [1, 2], 'path': 'demos'}
+    """
     if isinstance(value, Described):
         return value.as_dict()
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, Mapping):
+        return {str(name): plain(part) for name, part in value.items()}
+    if hasattr(value, "tolist"):  # arrays and tensors
+        return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return [plain(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 @dataclass(frozen=True)
@@ -114,10 +120,8 @@ class Difference(Described):
 
     >>> print(Difference(2.5, 1.0, 4.0, better=60, worse=10, count=2000, p_value=1e-9, method=""))
     +2.5 points [+1.0, +4.0] (60 better, 10 worse, n=2000)
-    >>> print(Difference(0.1, 0.0, 0.2, better=15, worse=5, count=10000, p_value=0.06, method=""))
-    +0.10 points [+0.00, +0.20] (15 better, 5 worse, n=10000)
 
-    A bound that one digit would round to zero gets two as well:
+    A bound that one digit would round to zero gets two:
 
     >>> print(Difference(0.2, 0.02, 0.3, better=10, worse=2, count=5000, p_value=0.04, method=""))
     +0.20 points [+0.02, +0.30] (10 better, 2 worse, n=5000)
