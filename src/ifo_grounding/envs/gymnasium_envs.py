@@ -192,7 +192,7 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         """Begin new episodes where ``mask``, with the given scenes [num_envs] or the next ones."""
         if not mask.any():
             return
-        rows = torch.from_numpy(np.flatnonzero(mask)).to(self._simulator.device)
+        begins = torch.tensor(mask, device=self._simulator.device)
         numbers = None
         if scenes is not None:
             given = np.atleast_1d(np.asarray(scenes))
@@ -200,9 +200,9 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
                 raise UserError(
                     f"options['scene'] must be integers, one for each of {self.num_envs} worlds"
                 )
-            numbers = torch.from_numpy(given.astype(np.int64)[mask]).to(self._simulator.device)
-        self._simulator.reset(rows, numbers)
-        self._texts[mask] = VOCABULARY.decode(self._simulator.instruction[rows].cpu())
+            numbers = torch.from_numpy(given.astype(np.int64)).to(self._simulator.device)
+        self._simulator.reset(begins, numbers)
+        self._texts[mask] = VOCABULARY.decode(self._simulator.instruction[begins].cpu())
         self._ended = self._ended & ~mask
 
     def _final(

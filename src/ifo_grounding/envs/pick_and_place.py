@@ -123,7 +123,7 @@ class PickAndPlaceEnv(NumberedEnv):
     @property
     def scene_numbers(self) -> Tensor:
         """Number of the scene that each row began with, int64 [num_envs]."""
-        return self._simulator.numbers
+        return self._simulator.numbers.clone()
 
     @property
     def truth(self) -> Scene:
@@ -156,11 +156,13 @@ class PickAndPlaceEnv(NumberedEnv):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         given: Any = {} if tensordict is None else tensordict
-        rows, numbers = self._asked(tensordict, self._simulator.started)
-        self._simulator.reset(rows, numbers)
+        mask, numbers = self._asked(tensordict)
+        self._simulator.reset(mask, numbers)
         tokens = given.get(keys.INSTRUCTION, None) if self.instructed else None
         # The instruction of an observation is over.
         if tokens is not None and numbers is not None and keys.PIXELS not in given:
+            every = torch.arange(self.num_envs, device=self.device)
+            rows = every if mask is None else every[mask]
             self._simulator.ask(rows, tokens[rows])
         result = self._observe()
         for name in DONE:
