@@ -132,20 +132,32 @@ class Simulator:
         if mask is None or not self.started:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if numbers is None:
-            numbers, fresh = self._following(mask)
+            numbers, drawn = self._following(mask)
+            places = numbers % len(drawn[0])
         else:
-            fresh = leaves(self.stream.scenes(numbers.where(mask, 0)))
+            drawn = leaves(self.stream.scenes(numbers.where(mask, 0)))
+            places = torch.arange(self.num_envs, device=self.device)
         self.steps.masked_fill_(mask, 0)
         torch.where(mask, numbers, self.numbers, out=self.numbers)
         if not self.started:
-            self._leaves = fresh
-        for leaf, new in zip(self._leaves, fresh, strict=True):
+            self._leaves = [source.index_select(0, places) for source in drawn]
+            return
+        if self.device.type == "cpu":  # which may be asked for the rows, and copies no others
+            rows = mask.nonzero().squeeze(-1)
+            places = places[rows]
+            for leaf, source in zip(self._leaves, drawn, strict=True):
+                leaf.index_copy_(0, rows, source.index_select(0, places))
+            return
+        for leaf, source in zip(self._leaves, drawn, strict=True):
+            new = source.index_select(0, places)
             torch.where(mask.view(-1, *[1] * (leaf.ndim - 1)), new, leaf, out=leaf)
 
     def _following(self, mask: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Take the stream's next scenes for the rows of a mask: their numbers and leaves.
+        """Number the stream's next scenes for the rows of a mask, int64 [num_envs], and draw them.
 
-        Scenes are drawn ahead, and lie at their number modulo their count.
+        Returns:
+            The numbers, and the leaves of scenes drawn ahead, each at its number modulo their
+            count.
         """
         on_cpu = self.device.type == "cpu"
         count = max(FEWEST, self.num_envs * (2 if on_cpu else AHEAD))
@@ -163,8 +175,7 @@ class Simulator:
         numbers = self._next + order - 1
         self._next += order[-1]
         self._most += int(order[-1]) if on_cpu else self.num_envs
-        places = numbers % count
-        return numbers, [leaf.index_select(0, places) for leaf in self._ahead]
+        return numbers, self._ahead
 
     @torch.inference_mode(False)
     def ask(self, rows: Tensor, tokens: Tensor) -> None:
