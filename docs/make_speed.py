@@ -10,7 +10,17 @@ from ifo_grounding.report import markdown_table
 
 OURS = "ifo-grounding"
 ORDER = (
-    *("step", "pixels", "rollout", "gymnasium", "collector-strong", "collector-paper", "sampler"),
+    *(
+        "step",
+        "pixels",
+        "worlds",
+        "worlds-pixels",
+        "rollout",
+        "gymnasium",
+        "collector-strong",
+        "collector-paper",
+        "sampler",
+    ),
     *("imitation-strong", "imitation-paper", "labelling", "transitions", "recording", "memory"),
     *("whole", "growth"),
 )
