@@ -11,12 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, check_below
-from ifo_grounding.tasks.vocabulary import Vocabulary
+from ifo_grounding.tasks.vocabulary import MOST_WORDS, Vocabulary, words_of
 
 PIECE_FRAMES = 512
 PIECE_BYTES = 16 << 20
-MOST_WORDS = 512
-"""Words that an instruction may have at most: all are padded to the longest."""
+MOST_FRAMES = 100_000
+MOST_BYTES = 1 << 30
+"""What an episode may hold in a file: small files can claim a lot."""
 LEAST_SIDE = 5
 """Arrays whose last axis alone is shorter than this are taken for images with colours last."""
 
@@ -78,7 +79,9 @@ class Reader:
         if not isinstance(sentence, str) or not sentence.strip():
             found = repr(sentence) if isinstance(sentence, str | None) else _kind(sentence)
             raise UserError(f"episode {name!r} has no instruction (found {found}): give a sentence")
-        words = len(sentence.split())
+        words = len(words_of(sentence, self.vocabulary is not None and self.vocabulary.punctuation))
+        if not words:
+            raise UserError(f"episode {name!r} has no instruction (found {sentence!r}): give words")
         if words > self.length:
             raise UserError(
                 f"episode {name!r} has an instruction of {words} words, {self.length} are allowed: "
@@ -101,6 +104,15 @@ class Reader:
         if close and (len(frames) == 1 or not torch.equal(frames[-1], frames[-2])):
             return torch.cat([frames, frames[-1:]])
         return frames.clone()  # whoever gives episodes one by one may write to their array again
+
+
+def check_size(frames: int, size: int) -> None:
+    """Refuse an episode of too many frames, or frames of too many bytes, before it is read."""
+    if frames > MOST_FRAMES or size > MOST_BYTES:
+        raise UserError(
+            f"it has more than {MOST_FRAMES} frames or {MOST_BYTES >> 20} MiB of pixels: cut it "
+            "into shorter episodes, or make its images smaller"
+        )
 
 
 def _kind(value: object) -> str:
