@@ -223,7 +223,7 @@ GOOD = np.zeros((3, 3, 16, 24), np.uint8)
     [
         (GOOD[:0], "go", "at least one frame"),
         (GOOD, " ", r"has no instruction \(found ' '\)"),
-        (GOOD, "...", r"has no instruction \(found '...'\): give words"),
+        (GOOD, "...", r"has no instruction \(found '...'\)"),
         (GOOD, None, r"has no instruction \(found None\)"),
         (GOOD, GOOD, r"has no instruction \(found a ndarray\): give a sentence"),
         (GOOD, "go go", "of 2 words, 1 are allowed: shorten it, or give"),

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, check_below
+from ifo_grounding.errors import UserError, check_below, optional
+from ifo_grounding.files import regular_file
 from ifo_grounding.tasks.vocabulary import MOST_WORDS, Vocabulary, words_of
 
 PIECE_FRAMES = 512
@@ -76,12 +79,11 @@ class Reader:
             yield torch.cat(waiting)
 
     def _sentence(self, name: Name, sentence: str) -> str:
-        if not isinstance(sentence, str) or not sentence.strip():
+        kept = self.vocabulary is not None and self.vocabulary.punctuation
+        words = len(words_of(sentence, kept)) if isinstance(sentence, str) else 0
+        if not words:
             found = repr(sentence) if isinstance(sentence, str | None) else _kind(sentence)
             raise UserError(f"episode {name!r} has no instruction (found {found}): give a sentence")
-        words = len(words_of(sentence, self.vocabulary is not None and self.vocabulary.punctuation))
-        if not words:
-            raise UserError(f"episode {name!r} has no instruction (found {sentence!r}): give words")
         if words > self.length:
             raise UserError(
                 f"episode {name!r} has an instruction of {words} words, {self.length} are allowed: "
@@ -145,6 +147,23 @@ def _checked(name: Name, given: Frames) -> Tensor:
             "[T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"
         )
     return frames
+
+
+def open_table(path: Path, kind: str = "parquet", **options: Any) -> Any:
+    """Open a table, or a folder of them; what is no regular file, as a pipe, is an OSError."""
+    for file in [path, *path.rglob("*")]:
+        if not file.is_dir():
+            regular_file(file)
+    return optional("pyarrow.dataset", extra="datasets").dataset(path, format=kind, **options)
+
+
+def read_table(table: Any, **chosen: Any) -> Any:
+    """Return what is chosen of a table, which is of one episode; refuse too much of it."""
+    read: list[Any] = []
+    for batch in table.to_batches(batch_size=256, **chosen):
+        read.append(batch)
+        check_size(sum(part.num_rows for part in read), sum(part.nbytes for part in read))
+    return optional("pyarrow", extra="datasets").Table.from_batches(read)
 
 
 @contextlib.contextmanager

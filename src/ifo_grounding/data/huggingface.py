@@ -112,12 +112,7 @@ def _episodes(
             return
         except BROKEN as error:  # datasets cannot decode a picture
             raise UserError(f"episode {number} cannot be read ({error})") from None
-        if not isinstance(row, Mapping):
-            raise UserError(
-                f"episode {number} is a {type(row).__name__}: a row is a mapping with {frames!r} "
-                f"and {instruction!r}"
-            )
-        if missing := {frames, instruction} - set(row):
+        if missing := {frames, instruction} - set(row if isinstance(row, Mapping) else ()):
             raise UserError(f"episode {number} has no {' and no '.join(sorted(missing))}")
         shown = row[frames]
         if isinstance(shown, Image.Image | Mapping):
@@ -138,10 +133,7 @@ def _episodes(
 def _source(step: int, picture: Any) -> tuple[str, Any]:
     """Return the name of a frame and what to read it from."""
     if isinstance(picture, str | Path):
-        raise UserError(
-            f"it names a file, {str(picture)!r:.80}: give pictures or arrays; load_pictures reads "
-            "files, of videos too"
-        )
+        raise UserError(f"it names a file, {str(picture)!r:.80}, as load_pictures reads them")
     if isinstance(picture, Mapping):
         content, path = picture.get("bytes"), picture.get("path")
         picture = content if path is None or content is not None else Path(path)

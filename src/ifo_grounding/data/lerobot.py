@@ -8,31 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import Episode, naming
+from ifo_grounding.data._episodes import Episode, naming, open_table, read_table
 from ifo_grounding.data._images import Source, stack_images
-from ifo_grounding.data._tables import open_table, read_episode
 from ifo_grounding.data._video import read_video
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import DAMAGED
-from ifo_grounding.data.pictures import (
-    FRAMES_PER_SECOND,
-    TRUNCATED,
-    new_folder,
-    rgb,
-    written_sentences,
-)
+from ifo_grounding.data.pictures import TRUNCATED, new_folder, rgb, written_sentences
 from ifo_grounding.errors import UserError, at_least_one, check_choice, optional
 from ifo_grounding.files import atomic_write, read_json, regular_file, write_json
 
-INFO, EPISODES, VERSION = "meta/info.json", "meta/episodes", "v3.0"
+INFO, VERSION = "meta/info.json", "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-VIDEO = f"videos/{{video_key}}/{FILE}.mp4"
-CAMERA = "observation.image"
-IMAGE = ["height", "width", "channels"]
-NUMBERS = ("frame_index", "episode_index", "index", "task_index")
+CAMERA, FRAMES_PER_SECOND = "observation.image", 4
 
 
 def load_lerobot(
@@ -83,45 +74,48 @@ def load_lerobot(
 
 
 class _Camera:
-    """What a camera saw, in videos that go on from episode to episode, or in a table."""
+    """What a camera saw, in videos that go on from episode to episode, or in tables."""
 
     def __init__(self, folder: Path, name: str | None) -> None:
         info = read_json(regular_file(folder / INFO))
-        if info["codebase_version"] != VERSION or info.get("video_path") not in (None, VIDEO):
+        if info["codebase_version"] != VERSION:
             raise UserError(
-                f"{folder} is of LeRobot's format {info['codebase_version']}, or laid out in its "
-                f"own way: convert it to {VERSION} with LeRobot's tools"
+                f"{folder} is of LeRobot's format {info['codebase_version']}: convert it to "
+                f"{VERSION} with LeRobot's tools"
             )
         kinds = {name: feature["dtype"] for name, feature in info["features"].items()}
         cameras = [name for name, kind in kinds.items() if kind in ("image", "video")]
         name = cameras[0] if name is None and len(cameras) == 1 else name
         check_choice("camera", name, cameras)
         self.folder, self.name, self.fps = folder, name, float(info["fps"])
-        self.table = open_table(folder / "data") if kinds[name] == "image" else None
-        places = ("chunk_index", "file_index", "from_timestamp")
-        self.places = [f"videos/{name}/{place}" for place in places if self.table is None]
+        self.files = f"videos/{name}" if kinds[name] == "video" else "data"
         self.path, self.time = Path(), 0.0
 
     def episodes(self) -> Iterator[dict[str, Any]]:
         """Yield what is said of each episode."""
-        table = open_table(self.folder / EPISODES)
-        columns = ["episode_index", "tasks", "length", *self.places]
-        columns += [TRUNCATED] * (TRUNCATED in table.schema.names)
+        table = open_table(self.folder / "meta/episodes")
+        known = (f"{self.files}/from_timestamp", TRUNCATED)
+        columns = ["episode_index", "tasks", "length"]
+        columns += [f"{self.files}/{part}_index" for part in ("chunk", "file")]
+        columns += [name for name in known if name in table.schema.names]
         for batch in table.to_batches(columns=columns):
             yield from batch.to_pylist()
 
     def frames(self, row: dict[str, Any], steps: range) -> Iterator[tuple[str, Source]]:
         """Yield some frames of an episode, each with its name."""
-        if self.table is None:
-            chunk, file, start = (row[place] for place in self.places)
-            path = VIDEO.format(video_key=self.name, chunk_index=chunk, file_index=file)
-            shown = (self._at(self.folder / path, start + step / self.fps) for step in steps)
-        else:
+        where = {name: row[f"{self.files}/{name}"] for name in ("chunk_index", "file_index")}
+        path = self.folder / self.files / FILE.format(**where)
+        if self.files == "data":
+            table = open_table(path.with_suffix(".parquet"))
             here = optional("pyarrow.dataset", "datasets").field("episode_index")
             chosen = {"columns": [self.name, "frame_index"], "filter": here == row["episode_index"]}
-            pictures = read_episode(self.table, **chosen).sort_by("frame_index")[self.name]
-            shown = (pictures[step].as_py()["bytes"] for step in steps)
-        yield from ((f"frame {step}", image) for step, image in zip(steps, shown, strict=True))
+            pictures = read_table(table, **chosen).sort_by("frame_index")[self.name]
+        for step in steps:
+            if self.files == "data":
+                yield f"frame {step}", pictures[step].as_py()["bytes"]
+            else:
+                time = row[f"{self.files}/from_timestamp"] + step / self.fps
+                yield f"frame {step}", self._at(path.with_suffix(".mp4"), time)
 
     def _at(self, path: Path, time: float) -> Image.Image:
         """Return what a video shows at a time; one that is open goes on where it can."""
@@ -145,46 +139,37 @@ def save_lerobot(demos: Demonstrations, folder: str | Path) -> None:
         folder: where to, a new or an empty one; it appears when everything is written.
 
     Raises:
-        UserError: as of :func:`~ifo_grounding.data.save_pictures`, or where pyarrow is missing.
+        UserError: as of :func:`~ifo_grounding.data.save_pictures`, or where pandas is missing.
     """
-    arrow, parquet, pandas = (
-        optional(name, extra="datasets") for name in ("pyarrow", "pyarrow.parquet", "pandas")
-    )
-    sentences, lengths = written_sentences(demos), demos.lengths
+    pandas = optional("pandas", extra="datasets")
+    sentences, lengths, numbers = written_sentences(demos), demos.lengths, torch.arange(len(demos))
     tasks, ends = sorted(set(sentences)), lengths.cumsum(0)
-    said = {"timestamp": "float32", **dict.fromkeys(NUMBERS, "int64")}
-    stored = arrow.struct({"bytes": arrow.binary(), "path": arrow.string()})
-    schema = arrow.schema([*said.items(), (CAMERA, stored)])
+    episodes = {"episode_index": numbers, "tasks": [[said] for said in sentences]}
+    episodes |= {"length": lengths, "dataset_from_index": ends - lengths, "dataset_to_index": ends}
+    episodes |= {"data/chunk_index": numbers // 1000, "data/file_index": numbers % 1000}
     with atomic_write(new_folder(folder)) as temporary:
-        files = [temporary / f"{name}/chunk-000/file-000.parquet" for name in ("data", EPISODES)]
-        for path in files:
-            path.parent.mkdir(parents=True)
-        with parquet.ParquetWriter(files[0], schema) as writer:
-            for number, sentence in enumerate(sentences):
-                shown = [_stored(frame) for frame in rgb(demos[number]["pixels"])]
-                step = np.arange(len(shown))
-                index = int(ends[number] - lengths[number]) + step
-                numbers = dict(
-                    zip(NUMBERS, (step, number, index, tasks.index(sentence)), strict=True)
-                )
-                rows = {"timestamp": step / FRAMES_PER_SECOND, **numbers, CAMERA: shown}
-                frame = pandas.DataFrame(rows)
-                writer.write_table(arrow.Table.from_pandas(frame, schema, preserve_index=False))
-        episodes: dict[str, Any] = {
-            "episode_index": range(len(demos)),
-            "tasks": [[said] for said in sentences],
+
+        def write(name: str, rows: dict[str, Any], index: Any = None) -> None:
+            path = temporary / f"{name}.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pandas.DataFrame(rows, index).to_parquet(path)
+
+        for number, sentence in enumerate(sentences):
+            step = np.arange(int(lengths[number]))
+            said = {"timestamp": (step / FRAMES_PER_SECOND).astype(np.float32), "frame_index": step}
+            said |= {"episode_index": number, "index": int(ends[number]) - len(step) + step}
+            said |= {"task_index": tasks.index(sentence)}
+            shown = [_stored(frame) for frame in rgb(demos[number]["pixels"])]
+            name = FILE.format(chunk_index=number // 1000, file_index=number % 1000)
+            write(f"data/{name}", said | {CAMERA: shown})
+        write("meta/episodes/chunk-000/file-000", episodes | {TRUNCATED: demos.cut})
+        write("meta/tasks", {"task_index": range(len(tasks))}, tasks)
+        features: dict[str, Any] = {
+            name: {"dtype": "int64", "shape": [1], "names": None} for name in said
         }
-        episodes |= {"length": lengths, "dataset_from_index": ends - lengths}
-        episodes |= {"dataset_to_index": ends, TRUNCATED: demos.cut}
-        episodes |= {"data/chunk_index": 0, "data/file_index": 0}
-        pandas.DataFrame(episodes).to_parquet(files[1], index=False)
-        named = pandas.Index(tasks, name="task")
-        table = pandas.DataFrame({"task_index": range(len(tasks))}, index=named)
-        table.to_parquet(temporary / "meta/tasks.parquet")
-        image = {"dtype": "image", "shape": [*demos.image_shape[1:], 3], "names": IMAGE}
-        features = {
-            name: {"dtype": kind, "shape": [1], "names": None} for name, kind in said.items()
-        }
+        features["timestamp"]["dtype"] = "float32"
+        names, shape = ["height", "width", "channels"], [*demos.image_shape[1:], 3]
+        features[CAMERA] = {"dtype": "image", "shape": shape, "names": names}
         info: dict[str, Any] = {
             "codebase_version": VERSION,
             "robot_type": None,
@@ -193,10 +178,10 @@ def save_lerobot(demos: Demonstrations, folder: str | Path) -> None:
         info |= {"total_episodes": len(demos), "total_frames": demos.n_frames}
         info |= {"total_tasks": len(tasks), "splits": {"train": f"0:{len(demos)}"}}
         info |= {"chunks_size": 1000, "data_path": f"data/{FILE}.parquet", "video_path": None}
-        write_json(temporary / INFO, info | {"features": features | {CAMERA: image}})
+        write_json(temporary / INFO, info | {"features": features})
 
 
 def _stored(frame: np.ndarray) -> dict[str, Any]:
     file = BytesIO()
     Image.fromarray(frame).save(file, "PNG")
-    return {"bytes": file.getvalue(), "path": None}
+    return {"bytes": file.getvalue(), "path": "frame.png"}

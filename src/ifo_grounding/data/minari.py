@@ -14,9 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import Episode, check_size
-from ifo_grounding.data._images import MODES, open_image
-from ifo_grounding.data._tables import open_table, read_episode
+from ifo_grounding.data._episodes import Episode, check_size, open_table, read_table
+from ifo_grounding.data._images import MODES, stack_images
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import DAMAGED
 from ifo_grounding.data.pictures import rgb, written_sentences
@@ -31,7 +30,6 @@ OBSERVED = "observations"
 ENDS = ("truncations", "terminations")
 """Names of what says how an episode ended."""
 ABSENT = "actions_absent"
-MOST_EPISODES = 10_000_000
 DESCRIPTION = (
     "Observation-only demonstrations: actions and rewards are absent. The format demands them, so "
     "both are 0 throughout and mean nothing."
@@ -89,9 +87,8 @@ def _local(minari: Any, dataset_id: str) -> MinariDataset:
             f"'minari download {dataset_id}', or check its name with 'minari list local'"
         )
     try:
-        facts = read_json(regular_file(folder / "metadata.json"))
-        if int(facts["total_episodes"]) > MOST_EPISODES:
-            raise ValueError(f"it says that it has {facts['total_episodes']} episodes")
+        if (count := read_json(regular_file(folder / "metadata.json"))["total_episodes"]) > 10**7:
+            raise ValueError(f"it claims {count} episodes")
         return minari.load_dataset(dataset_id)
     except Exception as error:  # damaged metadata ends in many ways
         raise UserError(f"{folder} cannot be read ({error})") from None
@@ -146,13 +143,9 @@ def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
     from minari.dataset.minari_storage import is_image_space
 
     if jpeg and is_image_space(space):
-        images = []
-        for row in rows:
-            images.append(np.asarray(open_image(bytes(row))))
-            check_size(len(images), len(images) * images[-1].nbytes)
-        frames = np.stack(images)
-    else:
-        frames = np.stack(rows).reshape(-1, *space.shape)
+        named = ((f"image {at}", bytes(row)) for at, row in enumerate(rows))
+        return stack_images(named, (*space.shape, 1)[2])
+    frames = np.stack(rows).reshape(-1, *space.shape)
     if frames.ndim == 3:
         return frames[:, None]
     if frames.ndim == 4 and frames.shape[-1] in MODES and frames.shape[1] not in MODES:
@@ -202,7 +195,7 @@ def _read_table(folder: Path, kind: str, number: int, name: str, part: str | Non
     if name in ENDS and name not in table.schema.names:
         return ()
     column = field(name) if part is None else field(name, part)
-    return read_episode(table, columns={"rows": column})["rows"].to_numpy()
+    return read_table(table, columns={"rows": column})["rows"].to_numpy()
 
 
 def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariDataset:

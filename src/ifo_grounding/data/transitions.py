@@ -218,17 +218,15 @@ def collect_transitions(
     return Collected(buffer, TransitionReport(taken, kept.bincount(minlength=len(taken))))
 
 
-def _compare_workers(env: EnvBase, pixels: Tensor) -> None:
-    """Warn where workers show the same scenes, frame for frame: they were made with one seed."""
+def _compare_workers(env: EnvBase, first: Tensor) -> None:
+    """Warn where workers begin with the same images, [W, *B, C, H, W]: they have one seed."""
     base = getattr(env, "base_env", env)
-    if isinstance(base, BatchedEnvBase) and base.num_workers > 1:
-        first = pixels[..., 0, :, :, :].flatten(1)
-        if len(first.unique(dim=0)) < len(first):
-            warnings.warn(
-                "several workers begin with the same image: unless the world always does, give "
-                "each a seed of its own, or call set_seed of the environment of all",
-                stacklevel=4,
-            )
+    if isinstance(base, BatchedEnvBase) and len(first.flatten(1).unique(dim=0)) < len(first):
+        warnings.warn(
+            "several workers begin with the same image: unless the world always does, give each "
+            "a seed of its own, or call set_seed of the environment of all",
+            stacklevel=4,
+        )
 
 
 def _collect(
@@ -252,7 +250,7 @@ def _collect(
         with tqdm(total=n, desc="collect", disable=not progress) as bar:
             for number, batch in enumerate(collector):
                 if not number:
-                    _compare_workers(env, batch[keys.PIXELS])
+                    _compare_workers(env, batch[keys.PIXELS][..., 0, :, :, :])
                 yield batch.select(*READ_KEYS).reshape(-1)[:remaining]
                 bar.update(min(frames, remaining))
                 remaining -= min(frames, remaining)
