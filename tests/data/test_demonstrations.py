@@ -13,21 +13,15 @@ import pytest
 import torch
 
 from comparing import assert_same
+from ifo_grounding import data
 from ifo_grounding.data import (
     Demonstrations,
     FrameCodec,
     LabelReport,
     first_frame_buffer,
-    from_huggingface,
-    from_minari,
     goal_buffer,
-    label_demonstrations,
     labelled_buffer,
-    load_lerobot,
-    load_pictures,
     record_demonstrations,
-    save_lerobot,
-    save_pictures,
     to_huggingface,
     to_minari,
 )
@@ -400,10 +394,10 @@ def test_a_recording_that_was_cut_stays_open_and_shows_no_success():
 @pytest.mark.parametrize(
     "again",
     [
-        lambda demos, path: save_pictures(demos, path) or load_pictures(path),
-        lambda demos, path: save_lerobot(demos, path) or load_lerobot(path),
-        lambda demos, path: from_huggingface(to_huggingface(demos, cache_dir=path)),
-        lambda demos, path: from_minari(to_minari(demos, "cut-v0")),
+        lambda demos, path: data.save_pictures(demos, path) or data.load_pictures(path),
+        lambda demos, path: data.save_lerobot(demos, path) or data.load_lerobot(path),
+        lambda demos, path: data.from_huggingface(to_huggingface(demos, cache_dir=path)),
+        lambda demos, path: data.from_minari(to_minari(demos, "cut-v0")),
     ],
 )
 def test_a_recording_that_was_cut_stays_so_however_it_is_written(again, tmp_path, monkeypatch):
@@ -421,9 +415,9 @@ def test_a_recording_that_was_cut_stays_so_however_it_is_written(again, tmp_path
     [
         first_frame_buffer,
         goal_buffer,
-        lambda demos: label_demonstrations(demos, None),
+        lambda demos: data.label_demonstrations(demos, None),
         lambda demos: labelled_buffer(demos, torch.zeros(1)),
-        lambda demos: save_pictures(demos, "nowhere"),
+        lambda demos: data.save_pictures(demos, "nowhere"),
     ],
 )
 def test_a_folder_is_no_demonstrations(use):

@@ -92,12 +92,9 @@ class _Camera:
         self.path, self.time = Path(), 0.0
 
     def episodes(self) -> Iterator[dict[str, Any]]:
-        """Yield what is said of each episode."""
+        """Yield what is said of each episode, but for statistics."""
         table = open_table(self.folder / "meta/episodes")
-        known = (f"{self.files}/from_timestamp", TRUNCATED)
-        columns = ["episode_index", "tasks", "length"]
-        columns += [f"{self.files}/{part}_index" for part in ("chunk", "file")]
-        columns += [name for name in known if name in table.schema.names]
+        columns = [name for name in table.schema.names if not name.startswith("stats/")]
         for batch in table.to_batches(columns=columns):
             yield from batch.to_pylist()
 
