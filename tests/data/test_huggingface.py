@@ -1,4 +1,5 @@
 import struct
+import zlib
 
 import datasets
 import numpy as np
@@ -137,6 +138,10 @@ def test_what_is_wrong_is_said_with_the_number_of_the_row(dataset, said):
         from_huggingface(dataset)
 
 
+SIZE = b"IHDR" + struct.pack(">2I5B", 60_000, 60_000, 8, 2, 0, 0, 0)
+BOMB = b"\x89PNG\r\n\x1a\n\0\0\0\r" + SIZE + struct.pack(">2I4s4x", zlib.crc32(SIZE), 0, b"IDAT")
+
+
 @pytest.mark.parametrize(
     ("content", "path", "said"),
     [
@@ -144,7 +149,7 @@ def test_what_is_wrong_is_said_with_the_number_of_the_row(dataset, said):
         (None, None, "None is no picture"),
         (None, "http://127.0.0.1:9/a.png", "no regular file"),
         (None, "zip://a.png::b.zip", "no regular file"),
-        (struct.pack(">2sI4xI4xHH", b"BM", 60, 54, 0, 0), None, "."),
+        (BOMB, None, "exceeds limit"),
     ],
 )
 def test_a_stored_picture_is_opened_by_this_library_alone(content, path, said):
