@@ -163,7 +163,6 @@ def changing(views, number):
         (None, {"image": None}, "no image None"),
         (None, {"instruction": "task"}, r"no instruction 'task' .* episode 0: name it"),
         (changing, {}, "episode 1 has 2 instructions"),
-        (None, {"instruction": "view"}, "its instruction is a ndarray, not a sentence"),
         (lambda views, n: {"view": views, "mission": [""] * len(views)}, {}, "episode 0 has no in"),
     ],
 )

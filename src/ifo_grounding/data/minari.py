@@ -130,9 +130,7 @@ def _episodes(
 
 
 def _text(value: Any) -> str:
-    if not isinstance(value, bytes | str):
-        raise UserError(f"its instruction is a {type(value).__name__}, not a sentence")
-    return value.decode() if isinstance(value, bytes) else value
+    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
