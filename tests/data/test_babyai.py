@@ -21,6 +21,7 @@ def test_the_bot_is_recorded_without_actions():
     demos = record_babyai("GoToObj", 6, seed=0, tile_size=10)
     assert len(demos) == 6 and demos.image_shape == (3, 80, 80)
     assert all(text.startswith("go to the") for text in demos.sentences())
+    assert demos.instruction_length == max(len(text.split()) for text in demos.sentences())
     for number in range(6):
         frames = demos[number]["pixels"]
         assert torch.equal(frames[-1], frames[-2])  # the stop

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from comparing import assert_same
+from ifo_grounding import data
 from ifo_grounding.data import (
     Demonstrations,
     FrameCodec,
@@ -216,6 +218,7 @@ GOOD = np.zeros((3, 3, 16, 24), np.uint8)
     [
         (GOOD[:0], "go", "at least one frame"),
         (GOOD, " ", r"has no instruction \(found ' '\)"),
+        (GOOD, "...", r"has no instruction \(found '...'\)"),
         (GOOD, None, r"has no instruction \(found None\)"),
         (GOOD, GOOD, r"has no instruction \(found a ndarray\): give a sentence"),
         (GOOD, "go go", "of 2 words, 1 are allowed: shorten it, or give"),
@@ -247,9 +250,9 @@ def test_other_things_than_episodes_are_refused(episode, said):
 
 
 def test_instructions_are_as_long_as_the_longest_or_as_told():
-    sentences = ["go", " ".join(["on"] * 20)]
+    sentences = ["go", " - ".join(["on"] * 20)]
     demos = Demonstrations.from_arrays([GOOD] * 2, sentences)
-    assert demos.instruction_length == 20 and demos.sentences() == sentences
+    assert demos.instruction_length == 20 and demos.sentences()[1] == " ".join(["on"] * 20)
     assert Demonstrations.from_arrays([GOOD] * 2, sentences, length=24).instruction_length == 24
     with pytest.raises(
         UserError, match=r"^episode 1 .* 20 words, 8 are allowed: shorten it, or give"
@@ -387,6 +390,40 @@ def test_a_recording_that_was_cut_stays_open_and_shows_no_success():
     assert said == ["up", "up"] and len(seen) == 6
     with pytest.raises(UserError, match="no demonstration shows its stop: close_episodes"):
         goal_buffer(demos[:1])
+
+
+@pytest.mark.parametrize(
+    "again",
+    [
+        lambda demos, path: data.save_pictures(demos, path) or data.load_pictures(path),
+        lambda demos, path: data.save_lerobot(demos, path) or data.load_lerobot(path),
+        lambda demos, path: data.from_huggingface(to_huggingface(demos, cache_dir=path)),
+        lambda demos, path: data.from_minari(to_minari(demos, "cut-v0")),
+    ],
+)
+def test_a_recording_that_was_cut_stays_so_however_it_is_written(again, tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    shown = np.arange(9, dtype=np.uint8).repeat(3 * 40 * 40).reshape(3, 3, 3, 40, 40)
+    mixed = [(0, shown[0], "go", True), (1, shown[1], "up"), (2, shown[2], "go", True)]
+    demos = Demonstrations.from_episodes(mixed)
+    assert demos.cut.tolist() == [True, False, True]
+    assert_same(again(demos, tmp_path / "d"), demos)
+    assert not demos[[0, 2]].cut.any()  # of none that shows it, the stop was not recorded
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        first_frame_buffer,
+        goal_buffer,
+        lambda demos: data.label_demonstrations(demos, None),
+        lambda demos: labelled_buffer(demos, torch.zeros(1)),
+        lambda demos: data.save_pictures(demos, "nowhere"),
+    ],
+)
+def test_a_folder_is_no_demonstrations(use):
+    with pytest.raises(UserError, match="'shown' is a str: give Demonstrations, such as load_pic"):
+        use("shown")
 
 
 def test_folders_of_others_are_left_alone(demos, tmp_path):

@@ -1,3 +1,6 @@
+import struct
+import zlib
+
 import datasets
 import numpy as np
 import pytest
@@ -101,10 +104,21 @@ def second(*frames):
     [
         ({"train": [GOOD], "test": [GOOD]}, r"one of the splits: .* with 'train', 'test'"),
         ([], "there is no episode"),
-        ("mine/boxes", "'mine/boxes' is a string: give the dataset itself"),
+        ("mine/boxes", "'mine/boxes' is a str: give the dataset itself"),
         ([GOOD | {"frames": np.full((2, 3, 16, 24), 300)}], r"episode 0 is torch\.int64"),
         ([GOOD, {"frames": GOOD["frames"]}], "episode 1 has no instruction"),
         ([GOOD, GOOD | {"frames": None}], "episode 1 has no frames"),
+        ([GOOD, 3], "episode 1 has no frames and no instruction"),
+        (3, "3 is a int: give the dataset itself"),
+        ([GOOD | {"frames": "a.mp4"}], "episode 0: it names a file, 'a.mp4', as load_pictures"),
+        (second("a.png"), "episode 1: it names a file, 'a.png'"),
+        (
+            datasets.Dataset.from_dict(
+                {"frames": ["a.mp4"], "instruction": ["go"]},
+                datasets.Features(frames=datasets.Video(), instruction=datasets.Value("string")),
+            ),
+            r"'frames' is a column of videos, .* for load_pictures \(with the extra video\)",
+        ),
         (second(), "episode 1 is .* at least one frame"),
         (
             second(*GOOD["frames"], Image.new("RGB", (8, 8))),
@@ -116,7 +130,7 @@ def second(*frames):
         (second({"bytes": None, "path": None}), r"frame 0 cannot be read \(None is no picture"),
         (second({"path": "http://a.b/c.png"}), "frame 0 cannot .* no regular file"),
         ([GOOD | {"frames": GOOD["frames"][0]}], "episode 0 is a single picture, .*: group"),
-        (datasets.Dataset.from_dict({"video": [1]}), r"\['frames'.* dataset.* name them with fra"),
+        (datasets.Dataset.from_dict({"video": [1]}), r"'frames'.* dataset.* name them with fra"),
     ],
 )
 def test_what_is_wrong_is_said_with_the_number_of_the_row(dataset, said):
@@ -124,12 +138,25 @@ def test_what_is_wrong_is_said_with_the_number_of_the_row(dataset, said):
         from_huggingface(dataset)
 
 
-@pytest.mark.parametrize("content", [b"no picture", None])
-def test_a_picture_that_datasets_cannot_decode_names_its_row(content):
-    rows = [GOOD, GOOD, GOOD | {"frames": [{"bytes": content, "path": None}] * 2}]
+SIZE = b"IHDR" + struct.pack(">2I5B", 60_000, 60_000, 8, 2, 0, 0, 0)
+BOMB = b"\x89PNG\r\n\x1a\n\0\0\0\r" + SIZE + struct.pack(">2I4s4x", zlib.crc32(SIZE), 0, b"IDAT")
+
+
+@pytest.mark.parametrize(
+    ("content", "path", "said"),
+    [
+        (b"no picture", None, "identify"),
+        (None, None, "None is no picture"),
+        (None, "http://127.0.0.1:9/a.png", "no regular file"),
+        (None, "zip://a.png::b.zip", "no regular file"),
+        (BOMB, None, "exceeds limit"),
+    ],
+)
+def test_a_stored_picture_is_opened_by_this_library_alone(content, path, said):
+    rows = [GOOD, GOOD, GOOD | {"frames": [{"bytes": content, "path": path}] * 2}]
     columns = datasets.Sequence(datasets.Image()), datasets.Value("string")
     features = datasets.Features(dict(zip(GOOD, columns, strict=True)))
-    with pytest.raises(UserError, match="episode 2 cannot be read"):
+    with pytest.raises(UserError, match=f"^episode 2: frame 0 cannot be read .*{said}"):
         from_huggingface(datasets.Dataset.from_list(rows, features=features))
 
 

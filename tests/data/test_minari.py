@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -5,7 +7,7 @@ import torch
 from gymnasium import spaces
 
 from comparing import all_frames, assert_same
-from ifo_grounding.data import Demonstrations, from_minari, to_minari
+from ifo_grounding.data import Demonstrations, _episodes, from_minari, to_minari
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY
 
@@ -171,8 +173,10 @@ def test_what_does_not_fit_is_said(make, options, said):
 
 
 def test_damaged_and_missing_datasets_are_refused(folder):
-    with pytest.raises(UserError, match="nothing-v0 not found locally"):
+    with pytest.raises(UserError, match=r"no dataset 'nothing-v0' .* 'minari download nothing-v0'"):
         from_minari("nothing-v0")
+    with pytest.raises(UserError, match="3 is no dataset of Minari: give one, or its id"):
+        from_minari(3)
     dataset, _ = another("other-v0")
     path = folder / "other-v0" / "data" / "main_data.hdf5"
     with h5py.File(path, "a") as file:
@@ -181,6 +185,31 @@ def test_damaged_and_missing_datasets_are_refused(folder):
         from_minari(dataset, image="view")
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(UserError, match="data cannot be read"):
+        from_minari(dataset, image="view")
+
+
+@pytest.mark.parametrize(
+    "damage", ["[1]", "{}", '{"total_episodes": 1e12}', '{"total_episodes": 1}', "[" * 9999, None]
+)
+def test_damaged_metadata_is_refused(damage, folder):
+    another("other-v0", 1)
+    path = folder / "other-v0" / "data" / "metadata.json"
+    path.unlink()
+    os.mkfifo(path) if damage is None else path.write_text(damage)
+    with pytest.raises(UserError, match="data cannot be read"):
+        from_minari("other-v0")
+
+
+@pytest.mark.parametrize("kind", ["hdf5", "arrow"])
+def test_an_episode_that_claims_too_much_is_not_read(kind, folder, monkeypatch):
+    dataset, _ = another("other-v0", data_format=kind)
+    if kind == "arrow":
+        monkeypatch.setattr(_episodes, "MOST_BYTES", 5 * BOX.shape[0] * BOX.shape[1] * 3)
+    else:  # 58 GB
+        with h5py.File(folder / "other-v0" / "data" / "main_data.hdf5", "a") as file:
+            del file["episode_3/observations/view"]
+            file.create_dataset("episode_3/observations/view", (10**7, *BOX.shape), np.uint8)
+    with pytest.raises(UserError, match=r"episode 3 cannot be read .*MiB of pixels: cut it into"):
         from_minari(dataset, image="view")
 
 

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from comparing import all_frames, assert_same
-from ifo_grounding.data import Demonstrations, load_pictures, save_pictures
+from ifo_grounding.data import Demonstrations, _episodes, load_pictures, save_pictures
 from ifo_grounding.data._video import read_video
 from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
@@ -38,10 +38,11 @@ def write(folder, *names):
     list_of(folder, *names)
 
 
-def make_video(path, frames=20, size=(32, 16), codec="libx264"):
+def make_video(path, frames=20, size=(32, 16), codec="libx264", **tags):
     """Make a video of plain or noisy frames, four a second, with its index in front."""
     draw = np.random.default_rng(0)
     with av.open(path, "w", options={"movflags": "faststart"}) as video:
+        video.metadata.update(tags)
         options = {"qscale": "1"} if codec == "mjpeg" else {"g": "5", "bf": "0"}
         stream = video.add_stream(codec, rate=4, options=options)
         stream.width, stream.height = size
@@ -211,6 +212,8 @@ NOISE = np.random.default_rng(0).integers(256, size=(16, 24, 3), dtype=np.uint8)
         ("episodes.jsonl", b"[" * 100_000, "line 1: a line is a JSON object"),
         ("episodes.jsonl", "{é}".encode("latin-1"), r"jsonl cannot be read .*: save it as UTF-8"),
         ("episodes.jsonl", line("a") + b"\n" + line("a"), "lists episode 'a' twice"),
+        ("episodes.jsonl", line("a", truncated="no"), "line 1: .* 'truncated', .* true or false"),
+        ("episodes.jsonl", line("a", frames="x" * 999), r"'a': it has no frames \(File name too"),
         ("episodes.jsonl", line("c"), "episode 'c': it has no frames: neither .*c nor"),
         ("episodes.jsonl", line("a", None), "'a' has no instruction .*found None"),
         ("episodes.jsonl", line("a", frames="."), "'a': .* holds none of .png.* but .jsonl"),
@@ -245,6 +248,21 @@ def test_a_list_of_other_files_is_no_video(content, tmp_path):
     os.mkfifo(tmp_path / "b.mp4")
     with pytest.raises(UserError, match="no regular file"):
         list(read_video(tmp_path / "b.mp4"))
+
+
+@pytest.mark.parametrize(("limit", "value"), [("MOST_FRAMES", 1), ("MOST_BYTES", 2000)])
+def test_episodes_have_bounds(limit, value, tmp_path, monkeypatch):
+    write(tmp_path, "a")
+    assert load_pictures(tmp_path, close=False).lengths.tolist() == [2]
+    monkeypatch.setattr(_episodes, limit, value)
+    with pytest.raises(UserError, match=r"^episode 'a': it has more than .* cut it into shorter"):
+        load_pictures(tmp_path)
+
+
+def test_a_video_may_have_a_title_that_is_no_text(tmp_path):
+    path = make_video(tmp_path / "a.mkv", frames=2, title="abc")
+    path.write_bytes(path.read_bytes().replace(b"abc", b"a\xffc"))
+    assert len(list(read_video(path))) == 2
 
 
 def test_a_recording_that_was_cut_stays_open(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 
 import pytest
@@ -41,8 +42,9 @@ def test_actions_explain_what_changed():
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_stops_are_kept_of_workers_in_processes():
-    worker = partial(PickAndPlaceEnv, "move", num_envs=4, seed=0, instructed=False)
-    workers = TransformedEnv(ParallelEnv(2, worker, mp_start_method="fork"), StepCounter())
+    make = partial(PickAndPlaceEnv, "move", num_envs=4, instructed=False)
+    makers = [partial(make, seed=number) for number in range(2)]
+    workers = TransformedEnv(ParallelEnv(2, makers, mp_start_method="fork"), StepCounter())
     try:
         report = collect_transitions(workers, 100, seed=0).report
     finally:
@@ -74,8 +76,13 @@ def test_any_number_of_steps_is_taken_exactly(n):
 def test_wrapped_environments_serve_too():
     plain = partial(PickAndPlaceEnv, "move", num_envs=2, seed=0, instructed=False)
     serial = SerialEnv(2, plain)
+    with pytest.warns(UserWarning, match="several workers begin with the same image: unless"):
+        collect_transitions(serial, 8, drop_unchanged=False)
+    serial.set_seed(0)
     for env in (TransformedEnv(plain(), StepCounter()), serial):
-        everything = collect_transitions(env, 60, drop_unchanged=False).buffer[:]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            everything = collect_transitions(env, 60, drop_unchanged=False).buffer[:]
         assert everything.shape == (60,) and everything["pixels"].shape == (60, 3, 48, 48)
     assert not serial.is_closed
     serial.close()

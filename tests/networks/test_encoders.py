@@ -35,7 +35,7 @@ def tiled(rows, height=6, width=6, kinds=9, channels=3):
 def test_images_keep_their_contrast_through_the_convolutions_of_a_new_encoder():
     torch.manual_seed(0)
     images = torch.randn(64, 3, 48, 48)
-    powers = [ConvEncoder(3, 32, 4)(images).square().mean().item() for _ in range(8)]
+    powers = [ConvEncoder(3, 32, 4).layers(images).square().mean().item() for _ in range(8)]
     assert 0.3 < sum(powers) / len(powers) < 1.5  # with PyTorch's own initial weights: 0.0005
 
 
@@ -98,3 +98,10 @@ def test_whole_numbers_that_are_no_bytes_are_no_images(dtype):
     policy = make_policy(Shapes((3, 48, 48), vocabulary_size=9), "paper", seed=0)
     with pytest.raises(UserError, match=r"bytes \(uint8\) or floats within 0..1"):
         policy(pixels=torch.zeros(2, 3, 48, 48, dtype=dtype), instruction=torch.ones(2, 16))
+
+
+@pytest.mark.parametrize("scale", [-1.0, 255.0, float("nan")])
+def test_floats_beyond_0_and_1_are_no_images(scale):
+    policy = make_policy(Shapes((3, 16, 16), vocabulary_size=9), "paper", seed=0)
+    with pytest.raises(UserError, match=r"floats are within 0..1, got .*: divide 0..255 by 255"):
+        policy(pixels=scale * torch.ones(2, 3, 16, 16), instruction=torch.ones(2, 16).long())

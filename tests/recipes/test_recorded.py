@@ -1,8 +1,14 @@
 """Demonstrations that were recorded elsewhere, through the recipes."""
 
 import pytest
+import torch
 
-from ifo_grounding.data import Demonstrations, record_demonstrations, save_pictures
+from ifo_grounding.data import (
+    Demonstrations,
+    record_demonstrations,
+    save_lerobot,
+    save_pictures,
+)
 from ifo_grounding.errors import UserError
 
 
@@ -30,17 +36,20 @@ def test_recorded_demonstrations_are_learned_from(options, tmp_path, demos, pict
         imitate_truth(given)
 
 
-@pytest.mark.parametrize("pictures", [False, True])
-def test_stops_that_are_not_shown_are_added(options, recipes, tmp_path, demos, pictures):
+@pytest.mark.parametrize("write", [Demonstrations.save, save_pictures, save_lerobot])
+@pytest.mark.parametrize("cut", [0, 5])
+def test_stops_are_added_where_none_is_shown(options, recipes, tmp_path, demos, write, cut):
+    """Where some are shown, the other recordings were cut."""
     from _shared import world_of
 
-    frames = [demos[number]["pixels"][:-1] for number in range(len(demos))]
+    opened = range(cut or len(demos))
+    frames = [demos[n]["pixels"][: -1 if n in opened else None] for n in range(len(demos))]
     open_ended = Demonstrations.from_arrays(
         frames, demos.sentences(), vocabulary=demos.vocabulary, tile_size=8
     )
-    (save_pictures if pictures else Demonstrations.save)(open_ended, tmp_path / "shown")
+    write(open_ended, tmp_path / "shown")
     read = world_of(options()).read(tmp_path / "shown")
-    assert read.lengths.equal(demos.lengths)
+    assert read.lengths.equal(demos.lengths - (torch.arange(len(demos)) < cut).long())
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks import make_policy
+from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
 from ifo_grounding.tasks.vocabulary import words_of
 
@@ -84,6 +86,34 @@ def test_a_vocabulary_whose_words_keep_punctuation_keeps_it():
     assert vocabulary.encode("Ball, then stop").tolist() == [[1, 2, 3, 0]]
     with pytest.raises(UserError, match=r"unknown word 'stop\.'"):
         vocabulary.encode("ball, then stop.")
+
+
+def test_punctuation_is_kept_where_it_is_wanted():
+    vocabulary = Vocabulary.from_sentences(["Stop!", "stop"], 2, punctuation=True)
+    assert vocabulary.words == ("stop", "stop!")
+    assert vocabulary.encode("STOP! stop").tolist() == [[2, 1]]
+
+
+def test_what_there_is_no_place_for_is_skipped_where_that_is_wanted():
+    """As of missions of an evaluation that no demonstration showed."""
+    words = Vocabulary(["go", "left"], length=2)
+    given = ["now go left left", "walk on"]
+    assert words.encode(given, skip_unknown=True).tolist() == [[1, 2], [0, 0]]
+    for preset in ("paper", "strong"):
+        policy = make_policy(Shapes((3, 48, 48), vocabulary_size=3), preset, seed=0)
+        pixels = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
+        tokens = torch.zeros(2, 16).long()
+        assert policy(pixels=pixels, instruction=tokens)[0].isfinite().all()
+    with pytest.raises(UserError, match="0 words"):
+        words.encode("...", skip_unknown=True)
+    with pytest.raises(UserError, match="unknown skip_unknown 'no': choose one of True, False"):
+        words.encode("go", skip_unknown="no")
+
+
+@pytest.mark.parametrize("length", [0, 10**7, 2.5])
+def test_lengths_have_bounds(length):
+    with pytest.raises(UserError, match="length must be"):
+        Vocabulary(["a"], length)
 
 
 @pytest.mark.parametrize("token", [-1, 3])

@@ -12,6 +12,7 @@ from ifo_grounding.data.labelling import (
     label_demonstrations,
     labelled_buffer,
 )
+from ifo_grounding.data.lerobot import load_lerobot, save_lerobot
 from ifo_grounding.data.minari import from_minari, to_minari
 from ifo_grounding.data.pictures import load_pictures, save_pictures
 from ifo_grounding.data.recording import record_demonstrations
@@ -42,9 +43,11 @@ __all__ = [
     "goal_buffer",
     "label_demonstrations",
     "labelled_buffer",
+    "load_lerobot",
     "load_pictures",
     "record_babyai",
     "record_demonstrations",
+    "save_lerobot",
     "save_pictures",
     "to_huggingface",
     "to_minari",

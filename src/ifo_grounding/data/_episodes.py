@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, check_below
-from ifo_grounding.tasks.vocabulary import Vocabulary
+from ifo_grounding.errors import UserError, check_below, optional
+from ifo_grounding.files import regular_file
+from ifo_grounding.tasks.vocabulary import MOST_WORDS, Vocabulary, words_of
 
 PIECE_FRAMES = 512
 PIECE_BYTES = 16 << 20
-MOST_WORDS = 512
-"""Words that an instruction may have at most: all are padded to the longest."""
+MOST_FRAMES = 100_000
+MOST_BYTES = 1 << 30
+"""What an episode may hold in a file: small files can claim a lot."""
 LEAST_SIDE = 5
 """Arrays whose last axis alone is shorter than this are taken for images with colours last."""
 
@@ -75,10 +79,11 @@ class Reader:
             yield torch.cat(waiting)
 
     def _sentence(self, name: Name, sentence: str) -> str:
-        if not isinstance(sentence, str) or not sentence.strip():
+        kept = self.vocabulary is not None and self.vocabulary.punctuation
+        words = len(words_of(sentence, kept)) if isinstance(sentence, str) else 0
+        if not words:
             found = repr(sentence) if isinstance(sentence, str | None) else _kind(sentence)
             raise UserError(f"episode {name!r} has no instruction (found {found}): give a sentence")
-        words = len(sentence.split())
         if words > self.length:
             raise UserError(
                 f"episode {name!r} has an instruction of {words} words, {self.length} are allowed: "
@@ -101,6 +106,15 @@ class Reader:
         if close and (len(frames) == 1 or not torch.equal(frames[-1], frames[-2])):
             return torch.cat([frames, frames[-1:]])
         return frames.clone()  # whoever gives episodes one by one may write to their array again
+
+
+def check_size(frames: int, size: int) -> None:
+    """Refuse an episode of too many frames, or frames of too many bytes, before it is read."""
+    if frames > MOST_FRAMES or size > MOST_BYTES:
+        raise UserError(
+            f"it has more than {MOST_FRAMES} frames or {MOST_BYTES >> 20} MiB of pixels: cut it "
+            "into shorter episodes, or make its images smaller"
+        )
 
 
 def _kind(value: object) -> str:
@@ -133,6 +147,23 @@ def _checked(name: Name, given: Frames) -> Tensor:
             "[T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"
         )
     return frames
+
+
+def open_table(path: Path, kind: str = "parquet", **options: Any) -> Any:
+    """Open a table, or a folder of them; what is no regular file, as a pipe, is an OSError."""
+    for file in [path, *path.rglob("*")]:
+        if not file.is_dir():
+            regular_file(file)
+    return optional("pyarrow.dataset", extra="datasets").dataset(path, format=kind, **options)
+
+
+def read_table(table: Any, **chosen: Any) -> Any:
+    """Return what is chosen of a table, which is of one episode; refuse too much of it."""
+    read: list[Any] = []
+    for batch in table.to_batches(batch_size=256, **chosen):
+        read.append(batch)
+        check_size(sum(part.num_rows for part in read), sum(part.nbytes for part in read))
+    return optional("pyarrow", extra="datasets").Table.from_batches(read)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, ImageSequence
 
+from ifo_grounding.data._episodes import check_size
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import regular_file
 
@@ -44,10 +45,15 @@ def open_image(source: Path | bytes) -> Image.Image:
     return image
 
 
-def stack_images(images: Iterable[tuple[str, Source]], channels: int = 3) -> np.ndarray:
+def stack_images(
+    images: Iterable[tuple[str, Source]],
+    channels: int = 3,
+    size: tuple[int, int] | None = None,
+) -> np.ndarray:
     """Return the images of an episode, each with its name, as frames [T + 1, C, H, W].
 
-    C is the number of ``channels``: 1 for grey, 3 for colours, 4 with alpha.
+    C is the number of ``channels``: 1 for grey, 3 for colours, 4 with alpha. With a ``size``, (H,
+    W), images are scaled to it.
 
     Raises:
         UserError: naming the image that cannot be read, is of another size or not made of bytes;
@@ -56,10 +62,11 @@ def stack_images(images: Iterable[tuple[str, Source]], channels: int = 3) -> np.
     frames: list[np.ndarray] = []
     for name, source in images:
         try:
-            shown = _pixels(source, MODES[channels])
+            shown = _pixels(source, MODES[channels], size)
         except BROKEN as error:
             raise UserError(f"{name} cannot be read ({error})") from None
         frames.append(shown.reshape(*shown.shape[:2], channels))
+        check_size(len(frames), len(frames) * shown.nbytes)
         if frames[-1].shape != frames[0].shape:
             found, first = (f"{one.shape[1]}x{one.shape[0]}" for one in (frames[-1], frames[0]))
             raise UserError(
@@ -70,7 +77,7 @@ def stack_images(images: Iterable[tuple[str, Source]], channels: int = 3) -> np.
     return np.stack(frames).transpose(0, 3, 1, 2)
 
 
-def _pixels(source: object, mode: str) -> np.ndarray:
+def _pixels(source: object, mode: str, size: tuple[int, int] | None) -> np.ndarray:
     """Return an image as it is shown, uint8 [H, W] or [H, W, C]."""
     if not isinstance(source, Source):
         raise TypeError(f"{source!r:.40} is no picture")
@@ -82,7 +89,8 @@ def _pixels(source: object, mode: str) -> np.ndarray:
             raise ValueError(f"it has numbers of mode {image.mode!r}: save 8 bits per colour")
         if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
             image = ImageOps.exif_transpose(image)
-        return np.asarray(image.convert(mode))
+        image = image.convert(mode)
+        return np.asarray(image.resize(size[::-1]) if size else image)
 
 
 def animation_frames(path: Path) -> Iterator[Image.Image]:

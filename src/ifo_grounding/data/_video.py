@@ -18,11 +18,15 @@ OPTIONS = {"format_whitelist": "mov,matroska,avi", "protocol_whitelist": "file"}
 
 
 def read_video(path: Path) -> Iterator[Image.Image]:
-    """Yield the frames of a video as a player shows them; refuse one that ends before it says."""
+    """Yield the frames of a video as a player shows them; refuse one that ends before it says.
+
+    The time of a frame in seconds is its ``info["time"]``.
+    """
     av = optional("av", extra="video")
     whole, end = 0, 0.0
     try:
-        with av.open(f"file:{regular_file(path)}", options=OPTIONS) as video:
+        opened = f"file:{regular_file(path)}"
+        with av.open(opened, options=OPTIONS, metadata_errors="replace") as video:
             if not video.streams.video:
                 raise UserError(f"{path} cannot be read (it shows nothing: is it cut short?)")
             stream = video.streams.video[0]
@@ -32,7 +36,9 @@ def read_video(path: Path) -> Iterator[Image.Image]:
                     end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
                 for frame in packet.decode():
                     pixels = frame.to_ndarray(format="rgb24")
-                    yield Image.fromarray(np.rot90(pixels, round(frame.rotation / 90)))
+                    shown = Image.fromarray(np.rot90(pixels, round(frame.rotation / 90)))
+                    shown.info["time"] = frame.time
+                    yield shown
             expected, seconds, rate = stream.frames, _seconds(video, stream), stream.average_rate
     except (OSError, av.FFmpegError) as error:
         raise UserError(f"{path} cannot be read ({error})") from None

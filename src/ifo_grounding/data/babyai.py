@@ -31,8 +31,6 @@ BABYAI_ACTIONS = ("left", "right", "forward", "pickup", "drop", "toggle", "done"
 DONE = BABYAI_ACTIONS.index("done")
 """The action that does nothing: how a policy says that it is done."""
 MISSIONS = ("ends", "waits", "none")
-LENGTH = 32
-"""Words of the longest mission of one room."""
 PATIENCE = 3
 """How many times as many episodes as asked for are played before the bot counts as unable."""
 
@@ -180,7 +178,6 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
     demos = Demonstrations.from_episodes(
         episodes(),
         vocabulary=vocabulary,
-        length=LENGTH,
         tile_size=tile_size if tile_size in TILE_SIZES else None,
         close=False,
     )

@@ -33,6 +33,7 @@ def first_frame_buffer(demos: Demonstrations, **options: Any) -> TensorDictRepla
     >>> len(first_frame_buffer(demos))
     5
     """
+    check_demonstrations(demos)
     stored = {keys.PIXELS: demos.starts, keys.INSTRUCTION: torch.arange(len(demos))}
     return frame_buffer(demos, stored, [keys.PIXELS], **options)
 
@@ -59,7 +60,7 @@ def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer
     >>> buffer[:]["final"].flatten().tolist()
     [False, False, True, True]
     """
-    refuse_empty(len(demos))
+    check_demonstrations(demos)
     closed = demos.closed
     if not closed.any():
         raise UserError("no demonstration shows its stop: close_episodes() adds it")
@@ -101,8 +102,9 @@ def frame_buffer(
     Raises:
         UserError: where there is no demonstration, or no entry.
     """
-    refuse_empty(len(demos))
-    refuse_empty(len(stored[keys.INSTRUCTION]), "transitions")
+    check_demonstrations(demos)
+    if not len(stored[keys.INSTRUCTION]):
+        raise UserError("there are no transitions: no episode has two frames")
     entries = TensorDict(stored, [len(stored[keys.INSTRUCTION])])
     for key in [*frame_keys, keys.INSTRUCTION]:
         entries[key] = entries[key].int()
@@ -130,7 +132,12 @@ def encoded_buffer(
     return buffer
 
 
-def refuse_empty(count: int, things: str = "demonstrations") -> None:
-    """Raise :class:`UserError` where there is nothing to make something of."""
-    if not count:
-        raise UserError(f"there are no {things}: is a selection, or the share of a split, empty?")
+def check_demonstrations(demos: object) -> None:
+    """Refuse what is no demonstrations, or none."""
+    if not isinstance(demos, Demonstrations):
+        raise UserError(
+            f"{demos!r:.80} is a {type(demos).__name__}: give Demonstrations, such as "
+            "load_pictures or Demonstrations.load returns"
+        )
+    if not len(demos):
+        raise UserError("there are no demonstrations: is a selection, or a share, empty?")

@@ -20,7 +20,7 @@ from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, whole
 from ifo_grounding.seeding import generator as seeded
-from ifo_grounding.tasks.vocabulary import Vocabulary
+from ifo_grounding.tasks.vocabulary import Vocabulary, words_of
 
 KIND = "ifo-grounding demonstrations"
 
@@ -152,7 +152,7 @@ class Demonstrations:
         codec, codes = FrameCodec.compress(reader.pieces(episodes), tile_size)
         sentences = reader.sentences
         words = vocabulary or Vocabulary.from_sentences(
-            sentences, length or max(len(sentence.split()) for sentence in sentences)
+            sentences, length or max(len(words_of(sentence)) for sentence in sentences)
         )
         tokens = words.encode(sentences)
         return cls(codec, codes, torch.tensor(reader.lengths), tokens, vocabulary=words)
@@ -205,6 +205,15 @@ class Demonstrations:
         last = self.starts + self.lengths - 1
         before = (last - 1).maximum(self.starts)
         return same_rows(self.codes, last, before) & (self.lengths > 1)
+
+    @property
+    def cut(self) -> Tensor:
+        """Whether each recording was cut before its stop, bool [N]: open ones among closed ones.
+
+        Where all are open, their stops were not recorded, and none counts as cut.
+        """
+        closed = self.closed
+        return ~closed & closed.any()
 
     def sentences(self) -> list[str]:
         """Return the instructions as text."""

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from ifo_grounding import keys
 from ifo_grounding.allocation import release_freed_memory
-from ifo_grounding.data.buffers import FINAL, frame_buffer
+from ifo_grounding.data.buffers import FINAL, check_demonstrations, frame_buffer
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, at_least_one
@@ -111,6 +111,7 @@ def label_demonstrations(
     Raises:
         UserError: where no episode has two frames, or the model writes no such logits.
     """
+    check_demonstrations(demos)
     if not demos.transitions:
         raise UserError("there is nothing to label: no episode has two frames")
     batch_size = at_least_one("batch_size", batch_size)
@@ -163,6 +164,7 @@ def labelled_buffer(
     >>> buffer.sample(4)["pixels"].shape
     torch.Size([4, 3, 48, 48])
     """
+    check_demonstrations(demos)
     actions = torch.as_tensor(actions)
     if actions.shape != (demos.transitions,):
         raise UserError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,12 +14,13 @@ import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
-from ifo_grounding.data._episodes import Episode
-from ifo_grounding.data._images import MODES, open_image
+from ifo_grounding.data._episodes import Episode, check_size, open_table, read_table
+from ifo_grounding.data._images import MODES, stack_images
 from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.folder import DAMAGED
 from ifo_grounding.data.pictures import rgb, written_sentences
 from ifo_grounding.errors import UserError, optional
-from ifo_grounding.files import atomic_write, regular_file
+from ifo_grounding.files import atomic_write, read_json, regular_file
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -66,13 +68,30 @@ def from_minari(
     """
     minari = optional("minari", extra="minari")
     if isinstance(dataset, str):
-        try:
-            dataset = minari.load_dataset(dataset)
-        except FileNotFoundError as error:
-            raise UserError(str(error)) from None
+        dataset = _local(minari, dataset)
+    if not isinstance(dataset, minari.MinariDataset):
+        raise UserError(f"{dataset!r:.40} is no dataset of Minari: give one, or its id")
     with _opened(dataset) as read:
         episodes = _episodes(dataset, read, image, instruction, progress)
         return Demonstrations.from_episodes(episodes, **options)
+
+
+def _local(minari: Any, dataset_id: str) -> MinariDataset:
+    """Return the dataset of an id that lies on this machine."""
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    folder = get_dataset_path(dataset_id) / "data"
+    if not folder.is_dir():
+        raise UserError(
+            f"there is no dataset {dataset_id!r} on this machine ({folder}): fetch it with "
+            f"'minari download {dataset_id}', or check its name with 'minari list local'"
+        )
+    try:
+        if (count := read_json(regular_file(folder / "metadata.json"))["total_episodes"]) > 10**7:
+            raise ValueError(f"it claims {count} episodes")
+        return minari.load_dataset(dataset_id)
+    except Exception as error:  # damaged metadata ends in many ways
+        raise UserError(f"{folder} cannot be read ({error})") from None
 
 
 def _episodes(
@@ -96,7 +115,7 @@ def _episodes(
             else:
                 facts = common | next(iter(storage.get_episode_metadata([number])))
                 said = {_text(facts[instruction])} if instruction in facts else set()
-        except (OSError, KeyError, ValueError) as error:
+        except (OSError, *DAMAGED) as error:
             raise UserError(f"episode {number} cannot be read ({error})") from None
         if not said:
             raise UserError(
@@ -122,9 +141,9 @@ def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
     from minari.dataset.minari_storage import is_image_space
 
     if jpeg and is_image_space(space):
-        frames = np.stack([np.asarray(open_image(bytes(row))) for row in rows])
-    else:
-        frames = np.stack(rows).reshape(-1, *space.shape)
+        named = ((f"image {at}", bytes(row)) for at, row in enumerate(rows))
+        return stack_images(named, (*space.shape, 1)[2])
+    frames = np.stack(rows).reshape(-1, *space.shape)
     if frames.ndim == 3:
         return frames[:, None]
     if frames.ndim == 4 and frames.shape[-1] in MODES and frames.shape[1] not in MODES:
@@ -162,18 +181,19 @@ def _read_group(file: Any, number: int, name: str, part: str | None) -> Any:
         found = found[step]
     if found.external or found.is_virtual:
         raise OSError(f"{found.name!r} lies in another file")
+    check_size(math.prod(found.shape[:1]), found.nbytes)
     return found[()]
 
 
 def _read_table(folder: Path, kind: str, number: int, name: str, part: str | None) -> Any:
-    from pyarrow import dataset
+    from pyarrow.dataset import field
 
-    files = folder / str(number)
-    table = dataset.dataset(files, format=kind, ignore_prefixes=["_", ".", "metadata.json"])
+    ignored = ["_", ".", "metadata.json"]
+    table = open_table(folder / str(number), kind, ignore_prefixes=ignored)
     if name in ENDS and name not in table.schema.names:
         return ()
-    column = dataset.field(name) if part is None else dataset.field(name, part)
-    return table.to_table(columns={"rows": column})["rows"].to_numpy()
+    column = field(name) if part is None else field(name, part)
+    return read_table(table, columns={"rows": column})["rows"].to_numpy()
 
 
 def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariDataset:
@@ -218,15 +238,16 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
     }
 
     def buffers() -> Iterator[EpisodeBuffer]:
-        for number, sentence in enumerate(sentences):
+        for number, (sentence, cut) in enumerate(zip(sentences, demos.cut.tolist(), strict=True)):
             frames = rgb(demos[number]["pixels"])
             steps = len(frames) - 1
+            last = np.arange(steps) == steps - 1
             yield EpisodeBuffer(
                 observations={IMAGE: frames, INSTRUCTION: [sentence] * len(frames)},
                 actions=np.zeros(steps, np.int64),
                 rewards=np.zeros(steps),
-                terminations=np.arange(steps) == steps - 1,
-                truncations=np.zeros(steps, bool),
+                terminations=last & (not cut),
+                truncations=last & cut,
             )
 
     try:

@@ -17,12 +17,14 @@ from tqdm import tqdm
 from ifo_grounding.data._episodes import Episode, naming
 from ifo_grounding.data._images import MODES, SUFFIXES, Source, animation_frames, stack_images
 from ifo_grounding.data._video import read_video, write_video
-from ifo_grounding.data.buffers import refuse_empty
+from ifo_grounding.data.buffers import check_demonstrations
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.files import atomic_write
 
 LIST = "episodes.jsonl"
+TRUNCATED = "truncated"
+"""What says of an episode that its recording was cut."""
 VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 READ = (".gif", *VIDEOS, *SUFFIXES)
 """Suffixes of files that hold all frames of an episode."""
@@ -93,15 +95,22 @@ def read_list(folder: Path) -> list[Listed]:
         try:
             entry = json.loads(line)
             name, instruction = str(entry["episode"]), entry["instruction"]
+            where, cut = str(entry.get("frames") or name), entry.get(TRUNCATED, False)
+            if not isinstance(cut, bool):
+                raise TypeError
         except (ValueError, KeyError, TypeError, RecursionError):
             raise UserError(
-                f"{path}, line {number}: a line is a JSON object with 'episode' and 'instruction'"
+                f"{path}, line {number}: a line is a JSON object with 'episode' and 'instruction', "
+                f"and {TRUNCATED!r}, where it is there, is true or false"
             ) from None
         if name in episodes:
             raise UserError(f"{path} lists episode {name!r} twice")
         with naming(name):
-            frames = _where(folder / str(entry.get("frames") or name))
-        episodes[name] = name, frames, instruction, bool(entry.get("truncated", False))
+            try:
+                frames = _where(folder / where)
+            except OSError as error:  # a name that no file can have
+                raise UserError(f"it has no frames ({error.strerror})") from None
+        episodes[name] = name, frames, instruction, cut
     if not episodes:
         raise UserError(f"{path} lists no episode")
     return list(episodes.values())
@@ -195,18 +204,14 @@ def save_pictures(
     check_choice("kind", kind, KINDS)
     scale = at_least_one("scale", scale)
     sentences = written_sentences(demos, tuple(MODES) if kind == "png" else COLOURS)
-    folder = Path(folder)
-    if folder.is_file() or any(folder.glob("*")):
-        raise UserError(
-            f"{folder} exists and is no empty folder: name another one, or remove it first"
-        )
     digits = len(str(len(demos) - 1))
-    with atomic_write(folder) as temporary:
+    with atomic_write(new_folder(folder)) as temporary:
         temporary.mkdir()
         lines = []
-        for number, sentence in enumerate(sentences):
+        for number, (sentence, cut) in enumerate(zip(sentences, demos.cut.tolist(), strict=True)):
             name = f"{number:0{digits}d}"
-            lines.append(json.dumps({"episode": name, "instruction": sentence}))
+            entry = {"episode": name, "instruction": sentence}
+            lines.append(json.dumps(entry | {TRUNCATED: True} if cut else entry))
             frames = rgb(demos[number]["pixels"]).repeat(scale, 1).repeat(scale, 2)
             if kind == "mp4":
                 write_video(temporary / f"{name}.mp4", frames, FRAMES_PER_SECOND)
@@ -217,9 +222,19 @@ def save_pictures(
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def new_folder(folder: str | Path) -> Path:
+    """Return a folder that is written next; refuse one that holds something."""
+    folder = Path(folder)
+    if folder.is_file() or any(folder.glob("*")):
+        raise UserError(
+            f"{folder} exists and is no empty folder: name another one, or remove it first"
+        )
+    return folder
+
+
 def written_sentences(demos: Demonstrations, colours: tuple[int, ...] = COLOURS) -> list[str]:
     """Return the instructions; refuse demonstrations that cannot be written as pictures."""
-    refuse_empty(len(demos))
+    check_demonstrations(demos)
     sentences = demos.sentences()
     if "" in sentences:
         raise UserError(f"demonstration {sentences.index('')} has no instruction: leave it out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import Categorical, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
 from tqdm import tqdm
 
 from ifo_grounding import keys
@@ -216,6 +218,17 @@ def collect_transitions(
     return Collected(buffer, TransitionReport(taken, kept.bincount(minlength=len(taken))))
 
 
+def _compare_workers(env: EnvBase, first: Tensor) -> None:
+    """Warn where workers begin with the same images, [W, *B, C, H, W]: they have one seed."""
+    base = getattr(env, "base_env", env)
+    if isinstance(base, BatchedEnvBase) and len(first.flatten(1).unique(dim=0)) < len(first):
+        warnings.warn(
+            "several workers begin with the same image: unless the world always does, give each "
+            "a seed of its own, or call set_seed of the environment of all",
+            stacklevel=4,
+        )
+
+
 def _collect(
     env: EnvBase, policy: RandomActions, n: int, progress: bool
 ) -> Iterator[TensorDictBase]:
@@ -235,7 +248,9 @@ def _collect(
     remaining = n
     try:
         with tqdm(total=n, desc="collect", disable=not progress) as bar:
-            for batch in collector:
+            for number, batch in enumerate(collector):
+                if not number:
+                    _compare_workers(env, batch[keys.PIXELS][..., 0, :, :, :])
                 yield batch.select(*READ_KEYS).reshape(-1)[:remaining]
                 bar.update(min(frames, remaining))
                 remaining -= min(frames, remaining)

@@ -55,10 +55,15 @@ def is_plain(image: Tensor) -> bool:
     return image.dtype == torch.uint8 and image.device.type == "cpu"
 
 
+SLACK = 0.2
+"""By which floats may leave 0..1, as images do that are scaled smoothly."""
+
+
 def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
     """Return pixels in the precision of the weights that read them.
 
-    Bytes are scaled to [0, 1], floats are taken as scaled already, and other numbers are refused.
+    Bytes are scaled to [0, 1], floats are taken as scaled already, which is checked on a CPU, and
+    other numbers are refused.
     """
     if pixels.dtype == torch.uint8:
         return pixels.to(weight.dtype).mul_(1 / 255)
@@ -67,6 +72,13 @@ def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
             f"images are bytes (uint8) or floats within 0..1, got {pixels.dtype}: convert them "
             "with pixels.to(torch.uint8)"
         )
+    if pixels.device.type == "cpu" and pixels.numel():
+        low, high = (float(end) for end in pixels.detach().aminmax())
+        if not -SLACK <= low <= high <= 1 + SLACK:
+            raise UserError(
+                f"images of floats are within 0..1, got {low:g}..{high:g}: divide 0..255 by 255, "
+                "and leave out what normalises them otherwise"
+            )
     return pixels.to(weight.dtype)
 
 

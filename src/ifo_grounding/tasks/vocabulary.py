@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, check_below
+from ifo_grounding.errors import UserError, check_below, check_choice, whole
 from ifo_grounding.keys import INSTRUCTION_LENGTH
 
 PAD = 0
+MOST_WORDS = 512
+"""Words that an instruction may have at most: all are padded to the longest."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,9 @@ class Vocabulary:
     def __post_init__(self) -> None:
         words = tuple(unicodedata.normalize("NFC", word) for word in self.words)
         object.__setattr__(self, "words", words)
+        object.__setattr__(self, "length", whole("length", self.length))
+        if not 1 <= self.length <= MOST_WORDS:
+            raise UserError(f"length must be 1..{MOST_WORDS} words, got {self.length}")
         if len(self._ids) != len(words):
             raise UserError("a vocabulary must not hold a word twice")
         if bad := [word for word in words if word.lower().split() != [word]]:
@@ -54,10 +59,14 @@ class Vocabulary:
 
     @classmethod
     def from_sentences(
-        cls, sentences: Iterable[str], length: int = INSTRUCTION_LENGTH
+        cls,
+        sentences: Iterable[str],
+        length: int = INSTRUCTION_LENGTH,
+        *,
+        punctuation: bool = False,
     ) -> Vocabulary:
-        """Collect the distinct words of sentences, in alphabetical order."""
-        return cls(sorted({word for s in sentences for word in words_of(s)}), length)
+        """Collect the distinct words of sentences, by :func:`words_of`, in alphabetical order."""
+        return cls(sorted({word for s in sentences for word in words_of(s, punctuation)}), length)
 
     def __len__(self) -> int:
         """Count the token ids, padding included."""
@@ -68,28 +77,30 @@ class Vocabulary:
 
         Args:
             sentences: one or several.
-            skip_unknown: whether to leave unknown words out.
+            skip_unknown: whether to leave out what the vocabulary has no place for: unknown words,
+                of which a sentence may consist, and those beyond its length.
 
         Raises:
             UserError: where a word is unknown, or a sentence is empty or too long.
         """
+        check_choice("skip_unknown", skip_unknown, (True, False))
         if isinstance(sentences, str):
             sentences = [sentences]
         tokens = torch.full((len(sentences), self.length), PAD, dtype=torch.int64)
         for row, sentence in enumerate(sentences):
             words = words_of(sentence, self.punctuation)
-            if skip_unknown:
-                words = [word for word in words if word in self._ids]
-            if unknown := [word for word in words if word not in self._ids]:
+            if skip_unknown and words:
+                words = [word for word in words if word in self._ids][: self.length]
+            elif unknown := [word for word in words if word not in self._ids]:
                 raise UserError(
                     f"unknown word {unknown[0]!r} in {sentence!r}: the vocabulary holds "
                     + ", ".join(self.words)
                 )
-            ids = [self._ids[word] for word in words]
-            if not 0 < len(ids) <= self.length:
+            elif not 0 < len(words) <= self.length:
                 raise UserError(
-                    f"{sentence!r} has {len(ids)} words: an instruction has 1 to {self.length}"
+                    f"{sentence!r} has {len(words)} words: an instruction has 1 to {self.length}"
                 )
+            ids = [self._ids[word] for word in words]
             tokens[row, : len(ids)] = torch.tensor(ids)
         return tokens
 

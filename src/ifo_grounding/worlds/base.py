@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.data import Demonstrations, Truth, load_pictures
+from ifo_grounding.data import Demonstrations, Truth, load_lerobot, load_pictures
+from ifo_grounding.data.lerobot import INFO
 from ifo_grounding.data.pictures import LIST
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Endings, SuitabilityResult
@@ -113,8 +114,11 @@ class World(ABC):
             raise UserError(f"recorded={folder} is no folder of demonstrations")
         if (folder / LIST).exists():
             demos = load_pictures(folder, vocabulary=self.vocabulary, progress=progress)
+        elif (folder / INFO).exists():
+            demos = load_lerobot(folder, vocabulary=self.vocabulary, progress=progress)
         else:
-            demos = Demonstrations.load(folder).close_episodes()
+            demos = Demonstrations.load(folder)
+            demos = demos if demos.cut.any() else demos.close_episodes()
         if self.vocabulary is None:
             self.vocabulary = demos.vocabulary
         elif demos.vocabulary != self.vocabulary:
