@@ -14,7 +14,6 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import Categorical, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
@@ -23,6 +22,7 @@ from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, at_least_one, whole
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
@@ -234,7 +234,7 @@ def _collect(
     )
     remaining = n
     try:
-        with tqdm(total=n, desc="collect", disable=not progress) as bar:
+        with progress_bar(total=n, desc="collect", shown=progress) as bar:
             for batch in collector:
                 yield batch.select(*READ_KEYS).reshape(-1)[:remaining]
                 bar.update(min(frames, remaining))
