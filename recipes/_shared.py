@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import shlex
 import sys
@@ -16,12 +17,13 @@ from torchrl import torchrl_logger
 
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
-from ifo_grounding.config import FREE, Options
+from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
-from ifo_grounding.machine import machine_of
+from ifo_grounding.machine import fastest_threads, machine_of
 from ifo_grounding.options import plain
+from ifo_grounding.progress import tell_progress
 from ifo_grounding.training import FitConfig, Run, Stage, Trial, fit
 from ifo_grounding.worlds import World
 
@@ -44,40 +46,74 @@ CHOSEN_ANEW = (
     *("instruction.threshold", "instruction.candidates", "instruction.choose"),
 )
 """Options that may differ from those of the run whose phase 1 is taken over."""
+UP_TO = {
+    **{"train_inverse": "collect_transitions", "label": "train_inverse", "imitate": "label"},
+    **dict.fromkeys(("train_instruction", "train_reward", "train_goal"), "imitate"),
+    **dict.fromkeys(("continue_imitation", "evaluate", "share"), "imitate"),
+    **{"self_examine": "train_goal", "imitate_truth": "record_demonstrations"},
+}
+"""The last stage that has to be done before another one."""
 _OPEN: set[Path] = set()
 _LOCKS = contextlib.ExitStack()
 """Of the runs that this process works on."""
+atexit.register(_LOCKS.close)
 
 
-def open_run(options: Options) -> Run:
+def open_run(options: Options, stage: str = "") -> Run:
     """Return the run of these options, which it is made with from now on.
 
-    A new one takes over what its ``base`` has made, but for phase 2.
+    A new one takes over what its ``base`` has made, but for phase 2. One that a command makes
+    nothing of is removed as the command ends.
+
+    Args:
+        options: of the command.
+        stage: what is done next; what it needs has to be there.
 
     Raises:
         UserError: where it was made with other options.
     """
     keep_freed_memory()
     torch.set_flush_denormal(True)  # late in training, tiny gradients would slow the CPU down
-    if options.threads:
-        torch.set_num_threads(options.threads)
     run = Run(options.run, options.logger)
+    is_new = run.options() is None
+    if not (options.base and is_new):
+        refuse_missing(run, options, stage)
     if run.folder not in _OPEN:
         world_of(options)  # what is wrong with it is said before anything begins
         _LOCKS.enter_context(run.lock())  # until this process ends
         _OPEN.add(run.folder)
+        if is_new:
+            _LOCKS.callback(run.drop_if_empty)
     if options.base:
-        if run.options() is None:
-            Run(options.base).begin(plain(options), [*FREE, *CHOSEN_ANEW])
-        run.take_over(Run(options.base), without=OF_PHASE_2)
+        base = Run(options.base)
+        if is_new and base.options() is not None:
+            base.begin(plain(options), [*FREE, *CHOSEN_ANEW])
+        run.take_over(base, without=OF_PHASE_2)
     run.begin(plain(options), FREE)
     return run
+
+
+def refuse_missing(run: Run, options: Options, stage: str) -> None:
+    """Refuse a stage before those that it needs are done, with the one command that does them."""
+    last = UP_TO.get(stage)
+    unused = "train_goal" if options.self_examine.reward == "action" else "train_reward"
+    before = [name for name in STAGES[: STAGES.index(last) + 1] if name != unused] if last else []
+    if missing := [name for name in before if not run.record(name)]:
+        given = [text for text in sys.argv[1:] if "=" in text and not text.startswith("until=")]
+        raise UserError(
+            f"{stage} needs {', '.join(missing)} of the run {run.name} first: ifo-grounding demo "
+            f"{shlex.join(given or [f'run={run.name}'])} until={missing[-1]}"
+        )
 
 
 def open_stage(options: Options, name: str) -> Stage:
     """Return a stage of the run, and say whether it is done."""
     release_freed_memory()  # of the stage before
-    stage = open_run(options).stage(name)
+    stage = open_run(options, name).stage(name)
+    threads = fastest_threads() if options.threads == "auto" else int(options.threads)
+    torch.set_num_threads(threads)
+    if options.progress:
+        tell_progress(name)
     print(f"{name}: {'running' if stage.result is None else 'done before'}", flush=True)
     return stage
 
@@ -151,7 +187,7 @@ def fit_options(options: Options, stage: Stage) -> dict[str, Any]:
         "seed": options.seed,
         "name": stage.name,
         "checkpoint_seconds": options.checkpoint_seconds,
-        "progress": shows_progress(options),
+        "progress": options.progress,
         "cudagraph": True,
     }
 
@@ -169,11 +205,6 @@ def decode_on(device: str, buffer: Any) -> None:
     parts = [part for part in transform.modules() if isinstance(part, FrameDecoder)]
     if all(part.table is not None for part in parts):
         transform.to(device)
-
-
-def shows_progress(options: Options) -> bool:
-    """Whether to show progress bars: if asked to, and if somebody can see them move."""
-    return options.progress and sys.stderr.isatty()
 
 
 def checksums(run: Run) -> dict[str, str]:
@@ -226,7 +257,13 @@ def result_file(options: Options) -> Path:
     return Path(str(options.results)) / f"{name}-seed{options.seed}.json"
 
 
-def write_result(options: Options, results: dict[str, Any], command: str) -> dict[str, Any]:
+def command(name: str) -> str:
+    """Return the command of this process."""
+    given = [text for text in sys.argv[1:] if "=" in text]
+    return f"ifo-grounding {name} {shlex.join(given)}".strip()
+
+
+def write_result(options: Options, results: dict[str, Any], name: str) -> dict[str, Any]:
     """Write one small file that says what was measured, by which command, where and how long.
 
     Raises:
@@ -235,21 +272,22 @@ def write_result(options: Options, results: dict[str, Any], command: str) -> dic
     from ifo_grounding.report import provenance  # reports are slow to import
 
     run = open_run(options)
-    records = {path.stem: read_json(path) for path in sorted((run / "stages").glob("*.json"))}
-    given = [text for text in sys.argv[1:] if "=" in text]
+    records = run.records()
     content = {
-        "command": f"ifo-grounding {command} {shlex.join(given)}".strip(),
+        "command": command(name),
         "options": plain(options),
         "stages": {name: record["seconds"] for name, record in records.items()},
         "seconds": round(sum(record["seconds"] for record in records.values()), 1),
         "machines": {name: record.get("machine") for name, record in records.items()},
+        "threads": {name: record.get("threads") for name, record in records.items()},
         "provenance": provenance(),
         "results": results,
     }
     write_json(run / "result.json", content)
     if options.results:
         file = result_file(options)
-        there = read_json(file)["options"].get("run") if file.exists() else options.run
+        kept = read_json(file, dict, ["options"])["options"] if file.exists() else plain(options)
+        there = kept.get("run") if isinstance(kept, dict) else None
         if there != options.run:
             raise UserError(
                 f"{file} is of the run {there}, not {options.run}: tell them apart with variant=, "

@@ -1,6 +1,6 @@
 """Step the simulator at random: what the inverse model learns from (paper, 1st-phase)."""
 
-from _shared import TRANSITIONS, finish, open_stage, shows_progress, simulator_of, tell, world_of
+from _shared import TRANSITIONS, finish, open_stage, simulator_of, tell, world_of
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
@@ -19,7 +19,7 @@ def collect(options: Options) -> dict:
         stop_action=world_of(options).stop_action,
         drop_unchanged=section.drop_unchanged,
         seed=options.seed,
-        progress=shows_progress(options),
+        progress=options.progress,
     )
     collected.save(stage.run / TRANSITIONS)
     counts = {name: getattr(collected.report, name).tolist() for name in ("taken", "kept")}

@@ -87,8 +87,12 @@ def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[st
     """Return the instructed world of the evaluation scenes, and how to play it."""
     scenes = {**evaluation_scenes(options), **chosen}
     env = world_of(options).instructed(min(episodes, ROWS), device=options.device, **scenes)
-    how = {"seed": scenes["seed"], "stream": scenes["stream"]}
-    return env, {"episodes": episodes, "max_steps": UNTIL_THE_END, **how}
+    how: dict[str, Any] = {"seed": scenes["seed"], "stream": scenes["stream"]}
+    return env, {
+        "episodes": episodes,
+        "max_steps": options.evaluate.max_steps or UNTIL_THE_END,
+        **how,
+    }
 
 
 def success_results(measured: dict[str, SuccessResult]) -> dict[str, Any]:
@@ -193,11 +197,12 @@ def audit_callback(
 
 
 @recipe_main
-def main(options: Options) -> None:
+def main(options: Options) -> dict:
     results = evaluate(options)
     if options.results:
         write_result(options, results, "evaluate")
     print(results_table(results))
+    return results
 
 
 if __name__ == "__main__":

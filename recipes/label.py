@@ -10,7 +10,6 @@ from _shared import (
     load_demonstrations,
     load_network,
     open_stage,
-    shows_progress,
     world_of,
 )
 
@@ -27,7 +26,7 @@ def label(options: Options) -> dict:
         return stage.result
     demos = load_demonstrations(stage.run)
     inverse = load_network(stage.run, INVERSE, "train_inverse", options)
-    _, report = label_demonstrations(demos, inverse, progress=shows_progress(options))
+    _, report = label_demonstrations(demos, inverse, progress=options.progress)
     report.save(stage.run / LABELS)
     found: dict[str, Any] = {"confidence": report.summary()}
     # Only the evaluation reads the truth: nothing of it goes back into training.

@@ -1,6 +1,6 @@
 """Record demonstrations, or read what others recorded: frames and instructions, never actions."""
 
-from _shared import DEMONSTRATIONS, TRUTH, finish, open_stage, shows_progress, tell, world_of
+from _shared import DEMONSTRATIONS, TRUTH, finish, open_stage, tell, world_of
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
@@ -12,9 +12,9 @@ def record(options: Options) -> dict:
         return stage.result
     world, n = world_of(options), options.demonstrations.n
     if options.recorded:
-        demos, truth = world.read(options.recorded, progress=shows_progress(options))[:n], None
+        demos, truth = world.read(options.recorded, progress=options.progress)[:n], None
     else:
-        demos, truth = world.demonstrate(n, seed=options.seed, progress=shows_progress(options))
+        demos, truth = world.demonstrate(n, seed=options.seed, progress=options.progress)
     if truth is not None:
         truth.save(stage.run / TRUTH)
     demos.save(stage.run / DEMONSTRATIONS)

@@ -10,6 +10,7 @@ from _shared import (
     POLICIES,
     REWARD,
     chosen_by,
+    command,
     load_demonstrations,
     load_network,
     open_run,
@@ -19,17 +20,19 @@ from evaluate import evaluate, played
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
+from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.files import read_json
 from ifo_grounding.report import (
     animation,
+    provenance,
     reliability_diagram,
     results_rows,
     trace_animation,
     training_curves,
     write_report,
 )
-from ifo_grounding.report.results import restored, unpacked
+from ifo_grounding.report.results import conclusion, meaning, restored, unpacked
 from ifo_grounding.stats import Rate
 from ifo_grounding.training import Run
 
@@ -88,14 +91,24 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     pictures |= curves(run)
     section = options.evaluate
     scenes = section.stream if section.split == "all" else f"{section.stream}, {section.split}"
+    rows = [{**row, "means": meaning(row["measured"])} for row in results_rows(results)]
     return write_report(
         run / "report",
-        {"Results": results_rows(results)},
+        {"Results": rows, "Made by": made_by(run)},
         pictures,
         title=f"{options.task}, preset {options.preset}",
-        summary=f"{options.demonstrations.n:,} demonstrations, seed {options.seed}, "
-        f"{section.episodes:,} evaluation scenes ({scenes}).",
+        summary=f"{conclusion(results)} {options.demonstrations.n:,} demonstrations, seed "
+        f"{options.seed}, {section.episodes:,} evaluation scenes ({scenes}).",
     )
+
+
+def made_by(run: Run) -> dict[str, Any]:
+    """Return command and version, and how long each stage took."""
+    path, known = run / "result.json", provenance()
+    how = read_json(path, dict, ["command"])["command"] if path.exists() else command("report")
+    version = " ".join(str(known[name]) for name in ("version", "commit") if known[name])
+    took = {name: f"{record['seconds']:,.0f} s" for name, record in run.records().items()}
+    return {"command": how, "version": version, **took}
 
 
 def recorded(policy: Any, scenes: list[int], options: Options, tile_size: int | None) -> list:
@@ -152,10 +165,13 @@ def curves(run: Run) -> dict[str, Any]:
     for stage, (title, wanted) in CURVES.items():
         path = run / "metrics" / f"{stage}.json"
         if path.exists():
-            found[title] = training_curves(read_json(path), wanted)
+            metrics = read_json(path, list)
+            if not all(isinstance(row, dict) for row in metrics):
+                raise UserError(f"{path} holds no metrics: delete it or restore it")
+            found[title] = training_curves(metrics, wanted)
             if stage == "self_examine":
                 title = "Audit of self-examination (validation scenes)"
-                found[title] = training_curves(read_json(path), AUDIT)
+                found[title] = training_curves(metrics, AUDIT)
     return found
 
 

@@ -16,7 +16,6 @@ from _shared import (
     load_network,
     open_stage,
     save_network,
-    shows_progress,
     simulator_of,
     tell,
     world_of,
@@ -70,7 +69,7 @@ def examine(options: Options) -> dict:
         checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
         callback=audit_callback(policy, reward, run, options),
-        progress=shows_progress(options),
+        progress=options.progress,
     )
     save_network(run, POLICIES["phase2"], policy)
     return finish(options, stage, history[-1], history)
@@ -103,7 +102,7 @@ def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPa
             pool,
             section.pairs,
             seed=options.seed,
-            progress=shows_progress(options),
+            progress=options.progress,
             **chosen_by(options),
         )
     return StartingPairs(pairs)

@@ -31,8 +31,7 @@ FILES = {
 
 
 def share(options: Options) -> list[Path]:
-    run = open_run(options)
-    run.need(POLICIES["phase1"], "imitate")
+    run = open_run(options, "share")
     words, facts = load_demonstrations(run).vocabulary, card_facts(run, options)
     written = []
     for name, files in FILES.items():
@@ -55,7 +54,7 @@ def card_facts(run: Run, options: Options) -> dict[str, object]:
         "Seed": options.seed,
     }
     if (run / "result.json").exists():
-        written = read_json(run / "result.json")
+        written = read_json(run / "result.json", dict, ["results", "command", "provenance"])
         rows = results_rows(written["results"])
         facts |= {row["measured"]: row["result [95% interval]"] for row in rows}
         facts["Command"] = f"`{written['command']}`"

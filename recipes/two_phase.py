@@ -5,7 +5,7 @@ python recipes/two_phase.py task=pick seed=1
 
 from collections.abc import Callable
 
-from _shared import open_run, write_result
+from _shared import load_demonstrations, open_run, simulator_of, world_of, write_result
 from collect_transitions import collect
 from controls import continue_imitation
 from evaluate import evaluate
@@ -19,8 +19,10 @@ from train_instruction import train_instruction
 from train_inverse import train_inverse
 from train_reward import train_reward
 
+from ifo_grounding.attributes import untransformed
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import STAGES, Options
+from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.report import results_table
 from report import report
 
@@ -30,6 +32,9 @@ def two_phase(options: Options) -> dict:
     for name, stage in stages_of(options).items():
         if STAGES.index(name) <= last:
             stage(options)
+        if name == "record_demonstrations" and (reason := phase_1_alone(options)):
+            print(f"phase 1 alone: {reason}", flush=True)
+            last = min(last, STAGES.index("imitate"))
     if options.controls.run and last == len(STAGES) - 1:
         continue_imitation(options)
     results = evaluate(options)
@@ -37,6 +42,19 @@ def two_phase(options: Options) -> dict:
         results = {**results, **references(options)}
     write_result(options, results, "demo")
     return results
+
+
+def phase_1_alone(options: Options) -> str | None:
+    """Return why nothing could be learned in phase 2 from what was recorded, None if it can."""
+    demos, by_goal = load_demonstrations(open_run(options)), options.self_examine.reward == "goal"
+    if len(demos.pool()) < 2:
+        return "all demonstrations have one instruction, so that there are none to choose between"
+    if by_goal and not demos.closed.any():
+        return "all demonstrations are cut short, so that no frame shows a goal that was reached"
+    never_stops = by_goal and world_of(options).stop_action is None
+    if never_stops and isinstance(untransformed(simulator_of(options)), GymnasiumEnv):
+        return "the world has no stop, at which the goal reward is paid: give world.stop=add"
+    return None
 
 
 def stages_of(options: Options) -> dict[str, Callable[[Options], dict]]:
@@ -56,10 +74,11 @@ def stages_of(options: Options) -> dict[str, Callable[[Options], dict]]:
 
 
 @recipe_main
-def main(options: Options) -> None:
+def main(options: Options) -> dict:
     results = two_phase(options)
     page = report(options, results)
     print(f"\n{results_table(results)}\n\nrun: {open_run(options).folder}\nreport: {page}")
+    return results
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
 import zipfile
@@ -16,6 +17,7 @@ from ifo_grounding.cli import recipe_names, recipes_folder
 from ifo_grounding.errors import UserError
 
 RECIPE = """
+import os, signal
 from _words import GREETING
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.errors import UserError
@@ -26,6 +28,12 @@ def main(options):
         raise UserError("unknown task 'fly':\\n   choose move or pick")
     if options.task == "interrupt":
         raise KeyboardInterrupt
+    if options.task == "end":
+        os.kill(os.getpid(), signal.SIGTERM)
+    if options.task == "measure":
+        import torch
+        from ifo_grounding.report.results import by_scene
+        return {"phase1": by_scene(torch.arange(20) > options.seed)}
     if options.task == "bug":
         raise RuntimeError("a bug")
     print(GREETING, options.task, options.imitate.lr, options.seed)
@@ -75,6 +83,10 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
         (["imitate.steps=many"], "option imitate.steps: value 'many'"),
         (["imitate.lr=-1"], "imitate: lr must be above 0"),
         (["task=a,b"], "ambiguous value for argument 'task=a,b'"),
+        (["=3"], "config group override must be"),
+        (["preset=null"], "config group override must be"),
+        (["--resolve"], "lexernoviablealtexception"),
+        (["task=${nonexistent}"], "option run: interpolation key 'nonexistent' not found"),
         (["task=fly"], "unknown task 'fly': choose move or pick"),
         (["-m", "preset=paper,huge"], "unknown preset 'huge': choose one of paper, strong"),
     ],
@@ -95,8 +107,16 @@ def test_several_values_run_one_after_the_other(recipes, capsys):
     assert list(Path.cwd().iterdir()) == []
 
 
-def test_an_interruption_is_no_mistake(recipes, capsys):
-    assert run("run", "greet", "task=interrupt") == 130
+def test_results_of_several_seeds_end_in_one_table(recipes, capsys):
+    assert run("run", "greet", "-m", "task=measure", "seed=4,6", "preset=strong,paper") == 0
+    *_, strong, paper = capsys.readouterr().out.splitlines()
+    assert strong.split()[:3] == ["measure-strong-demo-seed*", "2", "70.0%"]
+    assert paper.split()[:3] == ["measure-paper-demo-seed*", "2", "70.0%"]
+
+
+@pytest.mark.parametrize("task", ["interrupt", "end"])
+def test_an_interruption_is_no_mistake(recipes, capsys, task):
+    assert run("run", "greet", f"task={task}") == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
@@ -117,6 +137,21 @@ def test_help_of_a_recipe_lists_its_options(recipes, capsys):
     assert run("run", "greet", "task=pick", "--help") == 0
     assert "\n  task=pick " in capsys.readouterr().out
     assert run("run", "greet", "tsk=pick", "--help") == 2
+
+
+def test_help_of_a_recipe_shows_what_it_reads(capsys):
+    assert run("run", "imitate", "--help") == 0
+    printed = capsys.readouterr().out
+    assert "\n  imitate.lr=" in printed and "\n  networks.dropout=" in printed
+    assert "self_examine" not in printed and "ifo-grounding demo --help" in printed
+
+
+@pytest.mark.parametrize("module", ["ifo_grounding", "ifo_grounding.cli"])
+def test_the_package_is_the_command_too(module, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [module, "--version"])
+    monkeypatch.delitem(sys.modules, "ifo_grounding.cli")
+    runpy.run_module(module, run_name="__main__")
+    assert capsys.readouterr().out.startswith("ifo-grounding ")
 
 
 def test_help_of_recipes_with_options_of_their_own(capsys):

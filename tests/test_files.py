@@ -63,9 +63,12 @@ def test_of_several_writers_of_a_folder_one_stays_and_nothing_is_left_behind(tmp
     assert len(said) == 1 and said.pop().endswith("39")
 
 
-@pytest.mark.parametrize("content", ["[" * 200_000, "9" * 5_000, "{", b"\xff\xfe{"])
-def test_what_is_no_json_is_named(content, tmp_path):
+SHAPES = ["[1]", "3", "null", '"result"', "{}"]
+
+
+@pytest.mark.parametrize("content", ["[" * 200_000, "9" * 5_000, "{", b"\xff\xfe{", *SHAPES])
+def test_what_is_no_json_or_of_another_shape_is_named(content, tmp_path):
     path = tmp_path / "meta.json"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(UserError, match=r"meta\.json is not valid JSON"):
-        read_json(path)
+        read_json(path, dict, ["result"])

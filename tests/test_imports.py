@@ -16,6 +16,7 @@ from ifo_grounding import keys
 PACKAGE = Path(keys.__file__).parent
 ORDER = (
     ("keys", "errors", "seeding", "files", "machine", "allocation", "distinct", "mosaic"),
+    ("progress",),
     ("world",),
     ("tasks",),
     ("attributes", "modules", "episodes"),
@@ -27,7 +28,7 @@ ORDER = (
     ("report",),
     ("worlds",),
     ("config", "cli"),
-    ("options",),
+    ("options", "__main__"),
 )
 """The layers of the house: each imports those above it."""
 LEARNER = ("networks", "objectives", "transforms", "training")

@@ -10,7 +10,7 @@ from ifo_grounding.cli import recipes_folder
 from ifo_grounding.config import FREE, Options
 from ifo_grounding.data import record_demonstrations
 from ifo_grounding.errors import UserError
-from ifo_grounding.options import described, field_docs, options_of, plain
+from ifo_grounding.options import described, field_docs, options_of, options_of_jobs, plain
 from ifo_grounding.training import Run
 
 
@@ -37,14 +37,22 @@ def sections():
         ("preset=huge", "unknown preset 'huge': choose one of paper, strong"),
         ("world=moon", "unknown world 'moon': choose one of babyai, grid, gymnasium, own"),
         ("preset=null", "name=value"),
-        ("task=[a", "name=value"),
+        ("seed=[a", "name=value"),
+        ("=3", "name=value"),
+        ("task=a,b", "several values need --multirun"),
         (
             "+imitate.stepz=1",
             r"option imitate.stepz cannot be added .*did you mean 'imitate.steps'",
         ),
         ("~imitate", "option imitate.batch_size cannot be added or removed"),
-        ("run={a:1}", "option run"),
         ("run=/", "run needs a name"),
+        ("run=/tmp/../", "run needs a name"),
+        ("networks.features=-1", "networks: features must be at least 1"),
+        ("networks.features=2147483647", "networks: features must be at most"),
+        ("networks.dropout=nan", "networks: dropout"),
+        ("controls.lr=nan", "controls: lr"),
+        ("controls.lr=-1", "controls: lr must be above 0"),
+        ("evaluate.max_steps=0", "evaluate: max_steps must be at least 1"),
         ("task='${nonexistent}'", "nonexistent"),
         ("imitate.steps=99999999999999999999", "imitate.steps must be at most"),
         ("imitate.lr=-1", "imitate: lr must be above 0"),
@@ -60,6 +68,7 @@ def sections():
         ("until=imitat", "unknown until 'imitat'"),
         ("logger=wandbb", "unknown logger"),
         ("threads=100000", "threads must be at most 1024"),
+        ("threads=several", "threads must be a whole number"),
         ("checkpoint_seconds=nan", "checkpoint_seconds"),
         ("device=gpu", "device=gpu is none: use cpu, cuda or cuda:0"),
         ("variant=../../x", "variant"),
@@ -69,6 +78,24 @@ def test_what_is_wrong_is_said_in_one_line(wrong, said):
     with pytest.raises(UserError, match=said) as refused:
         options_of("budget=tiny", wrong)
     assert "\n" not in str(refused.value)
+
+
+NAMES = ["ü", "a#b", "a=b", "a[1]", "{a:1}", "2024_11_27", "1e-3", "1_000", "true", "null"]
+
+
+@pytest.mark.parametrize("name", [*NAMES, "it's", "a\\", "(x)", "$x", "a b", "'"])
+def test_a_name_is_a_text(name):
+    assert options_of(f"run={name}").run == name
+    several = options_of_jobs(recipes_folder() / "imitate.py", ["-m", f"run={name},b"])
+    assert [each.run for each in several] == [name, "b"]
+
+
+def test_a_name_may_be_quoted_refer_to_others_or_be_none(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    assert options_of("run='q r'").run == "q r"
+    assert options_of("seed=3", "run=mine-${seed}").run == "mine-3"
+    assert options_of("base=null").base is None
+    assert options_of("to=~/shared").to == "/home/me/shared"
 
 
 @pytest.mark.parametrize("preset", ["strong", "paper"])

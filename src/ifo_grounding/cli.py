@@ -6,7 +6,9 @@ import contextlib
 import functools
 import inspect
 import os
+import re
 import runpy
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
@@ -32,9 +34,12 @@ COMMANDS = {
 def one_line_errors() -> Iterator[None]:
     """Turn a :class:`UserError` into ``error: ...`` on stderr and exit code 2, without a traceback.
 
-    So it does with what the system refuses: a file that cannot be written, a full disk.
+    So it does with what the system refuses: a file that cannot be written, a full disk. SIGTERM
+    interrupts as SIGINT does.
     ``IFO_GROUNDING_TRACEBACK=1`` in the environment keeps the traceback.
     """
+    with contextlib.suppress(ValueError):  # another thread than the main one
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     except BrokenPipeError:  # whoever reads what is printed, such as `head`, has seen enough
@@ -56,6 +61,7 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
     The options are composed from ``conf/config.yaml`` and ``name=value`` on the command line, and
     checked; a recipe with a ``conf/<script name>.yaml`` has options of its own. What is wrong with
     them, and a :class:`UserError` of the recipe itself, becomes one line on stderr and exit code 2.
+    Results that several jobs return are printed as one table of means over their seeds.
     """
     script = Path(inspect.getfile(function)).resolve()
 
@@ -65,11 +71,17 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
             from ifo_grounding.options import help_text, options_of_jobs
 
             words = [word for word in sys.argv[1:] if word not in HELP]
+            found = []
             for options in options_of_jobs(script, words):
                 if len(words) < len(sys.argv) - 1:
-                    print(help_text(script.stem, options))
-                else:
-                    function(options)
+                    print(help_text(script, options))
+                elif isinstance(results := function(options), dict):
+                    seed = rf"(?<!\d){options.seed}(?!\d)"
+                    found.append((re.sub(seed, "*", options.run), results))
+            if found[1:]:
+                from ifo_grounding.report.results import seeds_table
+
+                print("", seeds_table(found), sep="\n")
 
     return main
 
@@ -155,3 +167,7 @@ def recipe_names() -> list[str]:
 def _unknown(what: str, given: str, allowed: Sequence[str]) -> str:
     hint = did_you_mean(given, allowed)
     return f"unknown {what} {given!r}{hint}: choose one of {', '.join(allowed)}"
+
+
+if __name__ == "__main__":
+    main()

@@ -7,18 +7,17 @@ Below each field stands what it means; ``--help`` and the docs' page of options 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, OmegaConf, open_dict
+from omegaconf import MISSING
 
-from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
+from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range, whole
 from ifo_grounding.machine import check_device
 from ifo_grounding.seeding import STREAMS
 from ifo_grounding.training.run import LOGGERS
 from ifo_grounding.training.self_examination import SelfExaminationConfig
 from ifo_grounding.training.supervised import FitConfig
-from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
 STAGES = (
     "record_demonstrations",
@@ -211,12 +210,14 @@ class EvaluateConfig:
     """Of the scenes."""
     audit_episodes: int = 1000
     """Episodes in which learned rewards are compared with true success."""
+    max_steps: int | None = None
+    """Most actions of an episode; null leaves it to the world."""
 
     def __post_init__(self) -> None:
         check_choice("mode", self.mode, ("greedy", "sampled", "both"))
         check_choice("stream", self.stream, STREAMS)
         check_choice("split", self.split, ("all", "train", "zero-shot"))
-        check_range(self, "episodes", "audit_episodes", least=1)
+        check_range(self, "episodes", "audit_episodes", "max_steps", least=1)
         check_range(self, "states", least=0)
 
 
@@ -228,6 +229,10 @@ class ControlsConfig:
     """Whether ``demo`` trains the control, too."""
     lr: float = 1e-3
     """Its learning rate."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        check_range(self, "lr", above=0)
 
 
 @dataclass
@@ -242,6 +247,11 @@ class NetworksConfig:
     """How fast the GRU and the gates learn, by the rest (``paper``)."""
     sentence_pooling: str | None = None
     """States of the GRU that make an encoded sentence: ``mean`` or ``last`` (``paper``)."""
+
+    def __post_init__(self) -> None:
+        check_range(self, "features", least=1, most=4096)
+        check_range(self, "dropout", least=0, most=0.999)
+        check_range(self, "sentence_rate", above=0, most=1000)
 
     def changed(self) -> dict[str, Any]:
         """Return the values that are not the preset's."""
@@ -264,8 +274,8 @@ class Options:
     """Of all randomness."""
     device: str = "cpu"
     """``cpu`` or ``cuda``."""
-    threads: int | None = None
-    """Threads of torch; null leaves torch's choice."""
+    threads: int | str = "auto"
+    """Threads of torch; ``auto`` takes one, or all where each stage begins faster with them."""
     run: str = "${task}-${preset}-${budget}-seed${seed}"
     """Name of the run's folder under the home folder, or a path."""
     base: str | None = None
@@ -307,21 +317,12 @@ class Options:
     def __post_init__(self) -> None:
         check_choice("logger", self.logger, LOGGERS)
         check_choice("until", self.until, (None, *STAGES))
-        check_range(self, "threads", least=1, most=1024)
+        if self.threads != "auto":
+            whole("threads", self.threads)
+            check_range(self, "threads", least=1, most=1024)
         check_range(self, "checkpoint_seconds", least=0, most=86_400)
-        if not str(self.run).strip(" /"):
+        if not str(self.run).strip() or Path(self.run).expanduser().resolve() == Path("/"):
             raise UserError("run needs a name, or the path of a folder")
         if set("/\\\0") & set(self.variant or ""):
             raise UserError(f"variant is part of a file's name, without slashes: {self.variant!r}")
         check_device(self.device)
-
-
-def register() -> None:
-    """Register the options, and those of each world, with Hydra."""
-    store = ConfigStore.instance()
-    store.store(name="options", node=Options)
-    for world in (Grid, BabyAI, Gymnasium):
-        node = OmegaConf.structured(world)
-        with open_dict(node):
-            node["_target_"] = f"ifo_grounding.worlds.{world.__name__}"
-        store.store(group="world", name=f"{world.__name__}Options", node=node, package="world")

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_ty
 from ifo_grounding import keys
 from ifo_grounding.attributes import untransformed
 from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.progress import progress_bar
 
 MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
 """How actions are chosen: the likeliest, or drawn from the policy's distribution."""
@@ -83,7 +84,7 @@ def play(
     true_reward = keys.REWARD if keys.REWARD in env.reward_keys else env.reward_keys[0]
     state = start
     with set_exploration_type(MODES[mode]):
-        for _ in range(max_steps):
+        for _ in progress_bar(range(max_steps), "play", leave=False):
             state[env.action_key] = _actions(policy, env, state, active)
             stepped = env.step(state)
             transition = stepped.reshape(rows)[active]

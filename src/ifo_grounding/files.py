@@ -7,9 +7,10 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,10 @@ TAKEN = (errno.ENOTEMPTY, errno.EEXIST)
 """Another writer's folder has come in the meantime."""
 WRITERS = 20
 """How often a folder is tried to be replaced that others replace, too."""
+
+
+LEFT = re.compile(r"\..+\.[0-9a-f]{8}\.(tmp|old)")
+"""Names of what is being written, and of what it takes the place of."""
 
 
 def home() -> Path:
@@ -69,6 +74,14 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def remove_leftovers(*folders: Path) -> None:
+    """Remove what killed writers left in folders, and nothing of another name."""
+    for left in (path for folder in folders for path in folder.glob(".*")):
+        if LEFT.fullmatch(left.name):
+            is_folder = left.is_dir() and not left.is_symlink()
+            shutil.rmtree(left) if is_folder else left.unlink(missing_ok=True)
+
+
 def _replace_folder(temporary: Path, path: Path) -> None:
     """Give a folder the name of another, which goes; of several writers the last one stays."""
     retired = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.old")
@@ -105,10 +118,14 @@ def _finite(content: Any) -> Any:
     return [_finite(value) for value in content] if isinstance(content, (list, tuple)) else content
 
 
-def read_json(path: str | Path) -> Any:
-    """Read JSON; a missing or damaged file is a :class:`UserError` that names it."""
+def read_json(path: str | Path, kind: Any = object, keys: Collection[str] = ()) -> Any:
+    """Read JSON, or refuse what is missing, damaged, no ``kind`` or a dict without ``keys``."""
     try:
-        return json.loads(Path(path).read_text())
+        content = json.loads(Path(path).read_text())
+        if not isinstance(content, kind) or any(key not in content for key in keys):
+            held = f" with {', '.join(keys)}" if keys else ""
+            raise ValueError(f"it holds no {kind.__name__}{held}")
+        return content
     except FileNotFoundError:
         raise UserError(f"{path} does not exist") from None
     except (ValueError, RecursionError) as error:  # no JSON, no text, too deep or too long

@@ -8,24 +8,27 @@ import dataclasses
 import inspect
 import itertools
 import json
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ifo_grounding.cli import recipes_folder
-from ifo_grounding.config import FREE, Options, register
+from ifo_grounding.config import FREE, Options
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.data.pictures import LIST, read_list
 from ifo_grounding.errors import UserError, did_you_mean
 from ifo_grounding.training.checkpoint import leaves
 from ifo_grounding.training.run import Run
+from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
 FEW = 1000
 """With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
@@ -35,8 +38,22 @@ CONFIG = "config"
 """Name of the YAML that all recipes begin with."""
 MULTIRUN = ("-m", "--multirun")
 """One job for each combination of values that options name, such as ``seed=0,1``."""
+TEXTS = {
+    field.name: "null" if "None" in str(field.type) else ""
+    for field in dataclasses.fields(Options)
+    if "str" in str(field.type) and field.name not in ("preset", "budget", "threads")
+}
+"""Options that are texts, whatever is in them, and what stands for none."""
+READ = {"world_of": "world", "build": "networks", "chosen_by": "instruction"}
+"""Sections that functions of recipes read."""
 
-register()
+STORE = ConfigStore.instance()
+STORE.store(name="options", node=Options)
+for world in (Grid, BabyAI, Gymnasium):
+    node = OmegaConf.structured(world)
+    with open_dict(node):
+        node["_target_"] = f"ifo_grounding.worlds.{world.__name__}"
+    STORE.store(group="world", name=f"{world.__name__}Options", node=node, package="world")
 
 
 def options_of(*overrides: str) -> Options:
@@ -78,13 +95,35 @@ def _composing(recipes: Path) -> Iterator[None]:
         raise explained(error) from None
 
 
+def quoted(word: str, several: bool = False) -> str:
+    """Return an option that is a text as Hydra takes it, whatever is in its value.
+
+    References stay, what is quoted already, null, and a comma that parts values, or may mean to.
+
+    >>> quoted("run=2024_11_27 #1")
+    "run='2024_11_27 #1'"
+    """
+    name, _, value = word.partition("=")
+    values = value.split(",")
+    as_it_is = "${" in value or value[:1] + value[1:][-1:] in ("''", '""')
+    as_it_is |= bool(re.match(r"\w+\(", value)) if several else len(values) > 1
+    if as_it_is or value in ("", TEXTS.get(name, value)):
+        return word
+    return f"{name}={','.join(map(_quote, values))}"
+
+
+def _quote(value: str) -> str:
+    path = str(Path(value).expanduser()) if value.startswith("~/") else value
+    return "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", r"\'"), path) + "'"
+
+
 def _combinations(words: Sequence[str]) -> list[list[str]]:
     """Return every combination of the values that options name, the last option's first."""
     given = [
         [f"{each.get_key_element()}={value}" for value in each.sweep_string_iterator()]
         if each.is_sweep_override()
         else [str(each.input_line)]
-        for each in OverridesParser.create().parse_overrides([*words])
+        for each in OverridesParser.create().parse_overrides([quoted(w, True) for w in words])
     ]
     return [[*job] for job in itertools.product(*given)]
 
@@ -96,9 +135,10 @@ def _settled(overrides: Sequence[str]) -> Options:
     what it learns (:data:`~ifo_grounding.config.FREE`); what it names otherwise is refused where
     the run is opened.
     """
-    cfg = compose(CONFIG, [*overrides])
+    overrides = [quoted(word) for word in overrides]
+    cfg = compose(CONFIG, overrides)
     _refuse_unknown(cfg)
-    named = [each.key_or_group for each in OverridesParser.create().parse_overrides([*overrides])]
+    named = [each.key_or_group for each in OverridesParser.create().parse_overrides(overrides)]
     number = _demonstrations(cfg)
     if number < FEW and cfg.preset == "strong" and "budget" not in named:
         cfg = compose(CONFIG, [*overrides, "budget=few"])
@@ -183,27 +223,36 @@ def explained(error: Exception) -> UserError:
         hint = did_you_mean(name, names)
         return UserError(f"unknown option {cause.full_key!r}{hint}: {where} {', '.join(names)}")
     said = str(cause).splitlines()[0]
+    if said.startswith("Ambiguous"):
+        return UserError(f"{said}: several values need --multirun, a comma in one \"'a,b'\"")
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
         return UserError(f"option {cause.full_key}: {said[:1].lower()}{said[1:]}")
     return UserError(f"{said}: options are written name=value; see --help")
 
 
-def help_text(recipe: str, options: Any) -> str:
-    """Return all options with their values and what they mean, section by section."""
+def help_text(script: Path, options: Any) -> str:
+    """Return the options that a recipe reads, with their values and meanings, by section."""
     lines = [
-        f"{recipe}: options are written name=value, those of a section section.name=value.",
+        f"{script.stem}: options are written name=value, those of a section section.name=value.",
         "",
     ]
     for group in ("preset", "budget", "world") if isinstance(options, Options) else ():
         files = (recipes_folder() / "conf" / group).glob("*.yaml")
         lines.append(f"  {group}: {', '.join(sorted(path.stem for path in files))}")
-    return "\n".join([*lines, "", *described(type(options), plain(options))])
+    values, some = plain(options), isinstance(options, Options) and script.stem != "two_phase"
+    if some:
+        text = script.read_text()
+        read = {*re.findall(r"options\.(\w+)", text), *(READ[n] for n in READ if f"{n}(" in text)}
+        values = {k: v for k, v in values.items() if k in read or not isinstance(v, dict)}
+    lines += ["", *described(type(options), values)]
+    return "\n".join(lines + ["", "all options: ifo-grounding demo --help"] * some)
 
 
 def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[str]:
-    """Write the options of a dataclass, those with options of their own last."""
+    """Write the options of a dataclass that have values, those with options of their own last."""
     docs = field_docs(kind)
-    fields = sorted(dataclasses.fields(kind), key=lambda each: isinstance(values[each.name], dict))
+    there = [each for each in dataclasses.fields(kind) if each.name in values]
+    fields = sorted(there, key=lambda each: isinstance(values[each.name], dict))
     for each in fields:
         value, name = values[each.name], f"{above}{each.name}"
         if isinstance(value, dict):

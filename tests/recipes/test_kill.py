@@ -51,6 +51,8 @@ def test_sigkill_changes_nothing(options, recipes, tmp_path):
     assert weights.keys() == expected.keys()
     assert all(torch.equal(weight, expected[key]) for key, weight in weights.items())
     results = [read_json(run / "stages" / "imitate.json")["result"] for run in (killed, whole)]
+    litter = [path for path in killed.rglob(".*.*") if path.suffix in (".tmp", ".old")]
+    assert not litter
     for result in results:
         result.pop("samples_per_second")
     assert results[0] == results[1]

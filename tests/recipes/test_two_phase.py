@@ -1,11 +1,14 @@
 """Both phases through the recipes: what they make, what is made once, what is refused."""
 
 import re
+import types
 
 import pytest
 import torch
 
 from ifo_grounding import networks
+from ifo_grounding.config import STAGES
+from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.report import results_table
@@ -45,6 +48,7 @@ def test_both_phases_of_strong_run_through_and_write_a_report(options, tmp_path)
 
     text = re.sub("base64,[A-Za-z0-9+/=]+", "", report(given).read_text())  # which may say anything
     assert "Self-examination" in text and "http" not in text
+    assert "of the scenes" in text and "scene by scene" in text and "Made by" in text
     audit = read_json(run / "metrics" / "self_examine.json")
     assert [row["step"] for row in audit] == [1, 2]
     assert all("success" in row and "suitable" in row for row in audit)
@@ -110,6 +114,7 @@ def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, 
     assert not (tmp_path / "third" / "policy-phase1.safetensors").exists()
     with pytest.raises(UserError, match="no finished stages"):
         two_phase(options(f"base={tmp_path / 'none'}", run="fourth"))
+    assert not (tmp_path / "none").exists()
 
 
 def test_options_replace_values_of_every_network(options, phase_1):
@@ -128,14 +133,46 @@ def test_the_network_of_another_run_is_refused(options, phase_1):
         load_network(open_run(options()), "inverse.safetensors", "train_inverse", options())
 
 
-def test_a_stage_without_what_it_needs_says_what_to_run(options):
+def test_a_stage_without_what_it_needs_says_what_to_run(options, tmp_path, monkeypatch):
     from evaluate import evaluate
     from imitate import imitate
+    from self_examine import examine
 
-    with pytest.raises(UserError, match="run the recipe record_demonstrations"):
+    monkeypatch.setattr("sys.argv", ["imitate.py", "run=a b", "until=label"])
+    first = "record_demonstrations, collect_transitions, train_inverse, label"
+    with pytest.raises(UserError, match=f"^imitate needs {first} of .* demo 'run=a b' until=label"):
         imitate(options())
-    with pytest.raises(UserError, match="run the recipe imitate"):
+    with pytest.raises(UserError, match=f"^evaluate needs {first}, imitate of .* until=imitate"):
         evaluate(options())
+    with pytest.raises(UserError, match=r"train_instruction, train_goal of .* until=train_goal"):
+        examine(options())
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("pool", "closed", "world", "said"),
+    [
+        (1, True, (), "have one instruction"),
+        (2, False, (), "are cut short"),
+        (2, True, ("world=gymnasium", "world.id=ifo_grounding/Move-v0"), "has no stop"),
+        (2, False, ("preset=paper",), None),
+    ],
+)
+def test_a_run_without_a_phase_2_ends_with_phase_1(
+    options, monkeypatch, capsys, pool, closed, world, said
+):
+    import two_phase
+
+    done, demos = [], types.SimpleNamespace(pool=lambda: [0] * pool, closed=torch.tensor([closed]))
+    stages = {name: lambda _, name=name: done.append(name) for name in STAGES}
+    monkeypatch.setattr(two_phase, "stages_of", lambda _: stages)
+    for name in ("open_run", "evaluate", "write_result"):
+        monkeypatch.setattr(two_phase, name, lambda *_: {})
+    monkeypatch.setattr(two_phase, "load_demonstrations", lambda _: demos)
+    monkeypatch.setattr(two_phase, "simulator_of", lambda _: object.__new__(GymnasiumEnv))
+    two_phase.two_phase(options(*world))
+    assert (said or "") in capsys.readouterr().out
+    assert done[-1] == ("imitate" if said else "self_examine")
 
 
 def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_states(options):

@@ -141,7 +141,7 @@ def test_no_goal_needs_more_steps_than_an_episode_has():
         ({"holdout": "x"}, "unknown holdout 'x'"),
         ({"max_steps": 0}, "max_steps must be at least 1"),
         ({"layout": {"size": 8}}, "a layout is a Layout"),
-        ({"task": "pick", "layout": Layout(boxes=(0, 0))}, "only 0 of 1 scenes admit|only 0 of 4096 scenes admit"),
+        ({"task": "pick", "layout": Layout(boxes=(0, 0))}, "only 0 of .* admit a suitable goal"),
     ],
 )
 def test_bad_requests_are_refused(monkeypatch, options, said):

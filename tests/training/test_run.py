@@ -122,8 +122,16 @@ def test_metrics_are_logged_once_also_after_a_kill(tmp_path, logger):
     log = run.stage("train").log()
     log({"loss": 3.0}, 10)
     log({"loss": 2.0, "reward/loss": 1.0}, 20)
-    again = run.stage("train").log()  # killed after step 20, its checkpoint was of step 10
+
+    def killed():
+        yield "loss", 1.5
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # a step is rather cut short than logged twice
+        log(types.SimpleNamespace(items=killed), 25)
+    again = run.stage("train").log()  # its checkpoint was of step 10
     again({"loss": 2.0, "reward/loss": 1.0}, 20)
+    again({"loss": 1.5, "reward/loss": 1.0}, 25)
     again({"loss": 1.0}, 30)
     del log, again
     found, folder = {}, run / "logs" / "train"
@@ -138,22 +146,24 @@ def test_metrics_are_logged_once_also_after_a_kill(tmp_path, logger):
         events = EventAccumulator(str(folder)).Reload()
         for key in events.Tags()["scalars"]:
             found[key] = [event.step for event in events.Scalars(key)]
-    assert found == {"train/loss": [10, 20, 30], "train/reward/loss": [20]}
+    assert found == {"train/loss": [10, 20, 25, 30], "train/reward/loss": [20]}
 
 
 def test_all_stages_of_a_run_are_one_run_of_wandb(tmp_path, monkeypatch):
-    made = []
+    made, wandb = [], types.ModuleType("wandb")
 
-    def get_logger(kind, folder, name, **options):
-        made.append((kind, name, options["wandb_kwargs"]["id"]))
+    def init(reinit=False, **options):
+        if reinit or not made:  # or the run at work is returned, also for another name
+            made.append((options["name"], options["id"]))
+        return types.SimpleNamespace(config={})
 
-    monkeypatch.setitem(sys.modules, "wandb", types.ModuleType("wandb"))
-    sys.modules["wandb"].__spec__ = types.SimpleNamespace()
-    monkeypatch.setattr("torchrl.record.loggers.get_logger", get_logger)
+    wandb.__spec__, wandb.init = types.SimpleNamespace(), init
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    monkeypatch.setattr("torchrl.record.loggers.wandb._has_wandb", True)
     for folder in ("one", "one", "other"):
         Run(tmp_path / folder, "wandb").stage("imitate").log()
-    assert made[0] == made[1] and made[0][:2] == ("wandb", "one")
-    assert made[2][1] == "other" and made[2][2] != made[0][2]
+    assert made[0] == made[1] and made[0][0] == "one"
+    assert made[2][0] == "other" and made[2][1] != made[0][1]
 
 
 def test_an_unknown_logger_is_refused(tmp_path):
@@ -235,9 +245,43 @@ def test_one_process_at_a_time_works_on_a_run(tmp_path):
     with pytest.raises(UserError, match=rf"process {other.pid} on \S+ since 2"), Run(folder).lock():
         pass
     assert len(list((folder / "stages").iterdir())) == 1
+    with Run(tmp_path / "own").lock():  # another container has processes of the same number
+        (folder / ".lock").write_bytes((tmp_path / "own" / ".lock").read_bytes())
+    with pytest.raises(UserError, match="in use by process"), Run(folder).lock():
+        pass
     other.kill()
     other.join()
     with Run(folder).lock():
         assert not list((folder / "stages").iterdir())
         with Run(folder).lock():  # once more by the same process
             pass
+
+
+def test_what_is_not_of_a_run_stays(tmp_path):
+    others = [".notes.tmp", ".draft.txt.bak.tmp", "stages/.mine.tmp", "src/.a.12345678.tmp"]
+    ours = [
+        ".policy.pt.1a2b3c4d.tmp",
+        ".labels.1a2b3c4d.old",
+        "stages/.a.json.1a2b3c4d.tmp",
+    ]
+    for name in (*others, *ours):
+        (tmp_path / name).mkdir(parents=True)
+    with Run(tmp_path).lock():
+        left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob(".*.*")}
+    assert left == set(others)
+
+
+def test_a_file_system_without_locks_gets_a_warning(tmp_path, monkeypatch):
+    monkeypatch.setattr("fcntl.flock", lambda *_: (_ for _ in ()).throw(OSError("not supported")))
+    with pytest.warns(UserWarning, match="has no lock .*not supported"), Run(tmp_path).lock():
+        pass
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_a_run_of_which_nothing_came_leaves_nothing(tmp_path, made):
+    run = Run(tmp_path / "run")
+    run.begin(OPTIONS)
+    if made:
+        run.stage("train").finish({})
+    run.drop_if_empty()
+    assert run.folder.exists() == made

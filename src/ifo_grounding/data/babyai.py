@@ -15,7 +15,6 @@ import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ifo_grounding.data._episodes import Episode
 from ifo_grounding.data.codec import TILE_SIZES
@@ -23,6 +22,7 @@ from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.envs.wrapping import world_seed
 from ifo_grounding.errors import UserError, at_least_one, check_choice, optional
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -164,7 +164,7 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
 
     def episodes() -> Iterator[Episode]:
         solved = filter(None, _played(make, seeds, processes))
-        shown = tqdm(itertools.islice(solved, n), f"record {level}", n, disable=not progress)
+        shown = progress_bar(itertools.islice(solved, n), f"record {level}", n, shown=progress)
         count = 0
         for count, (frames, mission, taken) in enumerate(shown, start=1):
             actions.extend(taken)

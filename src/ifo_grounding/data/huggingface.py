@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
 from ifo_grounding.data._episodes import Episode, naming
 from ifo_grounding.data._images import BROKEN, stack_images
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import TRUNCATED, rgb, written_sentences
 from ifo_grounding.errors import UserError, optional
+from ifo_grounding.progress import progress_bar
 
 if TYPE_CHECKING:
     import datasets
@@ -62,7 +62,7 @@ def from_huggingface(
             f"{dataset!r:.80} is a {type(dataset).__name__}: give the dataset itself, such as "
             "datasets.load_dataset(...) or datasets.load_from_disk(...) returns"
         )
-    rows = tqdm(_selected(dataset, frames, instruction), desc="read", disable=not progress)
+    rows = progress_bar(_selected(dataset, frames, instruction), desc="read", shown=progress)
     return Demonstrations.from_episodes(_episodes(rows, frames, instruction), **options)
 
 

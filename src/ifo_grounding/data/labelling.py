@@ -12,7 +12,6 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
-from tqdm import tqdm
 
 from ifo_grounding import keys
 from ifo_grounding.allocation import release_freed_memory
@@ -21,6 +20,7 @@ from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.modules import device_of, evaluating
+from ifo_grounding.progress import progress_bar
 
 KIND = "ifo-grounding labels"
 RELEASE_EVERY = 16
@@ -118,7 +118,7 @@ def label_demonstrations(
     device = torch.device(device or device_of(inverse) or "cpu")
     frame = demos.locate()[1]
     labels, sure, n_actions = [], [], 0
-    with evaluating(inverse), tqdm(total=len(frame), desc="label", disable=not progress) as bar:
+    with evaluating(inverse), progress_bar(total=len(frame), desc="label", shown=progress) as bar:
         for count, numbers in enumerate(frame.split(batch_size), 1):
             logits = _logits(demos, inverse, numbers, device)
             n_actions = logits.shape[-1]

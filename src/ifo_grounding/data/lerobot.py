@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from tqdm import tqdm
 
 from ifo_grounding.data._episodes import Episode, naming, open_table, read_table
 from ifo_grounding.data._images import Source, stack_images
@@ -20,6 +19,7 @@ from ifo_grounding.data.folder import DAMAGED
 from ifo_grounding.data.pictures import TRUNCATED, new_folder, rgb, written_sentences
 from ifo_grounding.errors import UserError, at_least_one, check_choice, optional
 from ifo_grounding.files import atomic_write, read_json, regular_file, write_json
+from ifo_grounding.progress import progress_bar
 
 INFO, VERSION = "meta/info.json", "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -56,7 +56,7 @@ def load_lerobot(
 
     def episodes() -> Iterator[Episode]:
         seen = _Camera(Path(folder), camera)
-        for row in tqdm(seen.episodes(), desc="read", disable=not progress):
+        for row in progress_bar(seen.episodes(), desc="read", shown=progress):
             number, tasks, length = (row[name] for name in ("episode_index", "tasks", "length"))
             with naming(number):
                 if len(tasks) != 1:

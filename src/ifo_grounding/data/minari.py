@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
-from tqdm import tqdm
 
 from ifo_grounding.data._episodes import Episode, check_size, open_table, read_table
 from ifo_grounding.data._images import MODES, stack_images
@@ -21,6 +20,7 @@ from ifo_grounding.data.folder import DAMAGED
 from ifo_grounding.data.pictures import rgb, written_sentences
 from ifo_grounding.errors import UserError, optional
 from ifo_grounding.files import atomic_write, read_json, regular_file
+from ifo_grounding.progress import progress_bar
 
 if TYPE_CHECKING:
     from minari import MinariDataset
@@ -106,7 +106,7 @@ def _episodes(
             f"there is no image {image!r} in the observation ({sorted(known) or 'one array'}): "
             "name it with image=..., or image=None where the observation is the image"
         )
-    for number in tqdm(dataset.episode_indices.tolist(), desc="read", disable=not progress):
+    for number in progress_bar(dataset.episode_indices.tolist(), desc="read", shown=progress):
         try:
             frames = _decoded(read(number, OBSERVED, image), shown, storage.jpeg_encoding)
             truncated, terminated = (np.any(read(number, name, None)) for name in ENDS)

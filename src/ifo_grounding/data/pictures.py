@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from PIL import Image
 from torch import Tensor
-from tqdm import tqdm
 
 from ifo_grounding.data._episodes import Episode, naming
 from ifo_grounding.data._images import MODES, SUFFIXES, Source, animation_frames, stack_images
@@ -21,6 +20,7 @@ from ifo_grounding.data.buffers import check_demonstrations
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.files import atomic_write
+from ifo_grounding.progress import progress_bar
 
 LIST = "episodes.jsonl"
 TRUNCATED = "truncated"
@@ -67,7 +67,7 @@ def load_pictures(
     check_choice("channels", channels, MODES)
 
     def episodes() -> Iterator[Episode]:
-        listed = tqdm(read_list(Path(folder)), desc="read", disable=not progress)
+        listed = progress_bar(read_list(Path(folder)), desc="read", shown=progress)
         for name, path, instruction, cut in listed:
             with naming(name):
                 frames = stack_images(_frames(path), channels)

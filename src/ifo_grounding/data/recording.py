@@ -6,12 +6,12 @@ from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
 from ifo_grounding.errors import at_least_one, check_choice
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
 from ifo_grounding.tasks.scenes import Scene, SceneOptions
@@ -71,7 +71,7 @@ def record_demonstrations(
     drawn = SceneStream(options, derive(seed, "demonstrations"))
     parts: list[Tensor] = []
     lengths, instructions, actions = [], [], []
-    bar = tqdm(total=n, desc="record", disable=not progress)
+    bar = progress_bar(total=n, desc="record", shown=progress)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # for steps this small, threads wait more than they work
     try:

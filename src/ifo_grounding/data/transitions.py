@@ -16,7 +16,6 @@ from torchrl.collectors import Collector
 from torchrl.data import Categorical, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
-from tqdm import tqdm
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
@@ -25,6 +24,7 @@ from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, at_least_one, whole
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
@@ -247,7 +247,7 @@ def _collect(
     )
     remaining = n
     try:
-        with tqdm(total=n, desc="collect", disable=not progress) as bar:
+        with progress_bar(total=n, desc="collect", shown=progress) as bar:
             for number, batch in enumerate(collector):
                 if not number:
                     _compare_workers(env, batch[keys.PIXELS][..., 0, :, :, :])

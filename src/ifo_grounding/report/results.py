@@ -10,7 +10,14 @@ import numpy as np
 from torch import Tensor
 
 from ifo_grounding.report.tables import text_table
-from ifo_grounding.stats import Difference, Estimate, Rate, wilson
+from ifo_grounding.stats import (
+    Difference,
+    Estimate,
+    Rate,
+    paired_difference,
+    two_level_bootstrap,
+    wilson,
+)
 
 COMPARED = {
     "continued": "imitation continued, success (control)",
@@ -18,6 +25,19 @@ COMPARED = {
     "demonstrator": "demonstrator, success (reference)",
 }
 """What phase 2 is compared with, by its name in the results."""
+MEANINGS = {
+    "inverse": "labelled actions that are the demonstrator's own",
+    "phase": "evaluation scenes in which the policy does what it is told",
+    "phase 2 -": "what self-examination changed, scene by scene",
+    "imitation": "the same for the policy that phase 2 is compared with",
+    "demonstrator": "the same for the demonstrator",
+    "suitable": "chosen instructions that make sense in their scene",
+    "states": "scenes for which an instruction was chosen, or could be",
+    "recall": "instructions that make sense and are found to",
+    "action": "how often the better one of two is paid more (0.5: as often as by chance)",
+    "goal": "how often a success is paid more than a failure (0.5: as often as by chance)",
+}
+"""What rows of results mean, by how they begin."""
 Measured = TypeVar("Measured", Rate, Estimate, Difference)
 
 
@@ -64,6 +84,38 @@ def _measurements(results: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
         "goal_return": "goal return against true success, AUC",
     }.items():
         yield title, Estimate, (results.get(name) or {}).get("auc")
+
+
+def meaning(measured: str) -> str:
+    """Return what a row of results means."""
+    return MEANINGS[max(name for name in MEANINGS if measured.startswith(name))]
+
+
+def conclusion(results: Mapping[str, Any]) -> str:
+    """Return in one sentence what a run found; results as for :func:`results_rows`."""
+    names = [name for name in ("phase1", "phase2") if results.get(name)]
+    before, *after = (brief(restored(Rate, results[name]["rate"])) for name in names)
+    if not after:
+        return f"Phase 1 succeeds in {before} of the scenes; there is no phase 2."
+    if results["phase2"] == results["phase1"]:
+        return f"No phase-2 checkpoint beat phase 1, which is reported: {before} of the scenes."
+    gain = restored(Difference, results["gain"])
+    chance = ", which may be chance" if gain.low <= 0 <= gain.high else ""
+    return f"Phase 2 gains {brief(gain)} points{chance}: from {before} of the scenes to {after[0]}."
+
+
+def seeds_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
+    """Return means and intervals over runs, each the name of a row and what was measured."""
+    rows = []
+    for name in dict.fromkeys(name for name, _ in runs):
+        same = [{"results": results} for each, results in runs if each == name]
+        there = [p for p in ("phase1", "phase2") if all(p in run["results"] for run in same)]
+        solved = [unpacked(same, phase) for phase in there]
+        row: dict[str, Any] = {"runs": name, "seeds": len(same)}
+        row |= {p: brief(two_level_bootstrap(s)) for p, s in zip(there, solved, strict=True)}
+        gain = {"gain, points": brief(paired_difference(*solved))} if solved[1:] else {}
+        rows.append(row | gain)
+    return text_table(rows)
 
 
 def results_table(results: Mapping[str, Any]) -> str:

@@ -6,9 +6,8 @@ import math
 import time
 from collections.abc import Callable, Iterator
 
-from tqdm import tqdm
-
 from ifo_grounding.errors import UserError
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.training.checkpoint import Checkpoint
 
 Metrics = dict[str, float]
@@ -39,9 +38,9 @@ class Loop:
 
     def __iter__(self) -> Iterator[int]:
         """Yield the iterations that are still to be done, and show how far they are."""
-        off = not self.progress
         first, end = self.done, self.iterations
-        with tqdm(total=end, initial=first, desc=self.name, disable=off, leave=False) as bar:
+        how = {"total": end, "initial": first, "leave": False}
+        with progress_bar(desc=self.name, shown=self.progress, **how) as bar:
             for iteration in range(first, end):
                 yield iteration
                 bar.set_postfix(_shown(self.history[-1]), refresh=False)

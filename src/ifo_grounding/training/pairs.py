@@ -7,10 +7,10 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.keys import INSTRUCTION, PIXELS, SCENE
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import generator
 from ifo_grounding.transforms.base import check_pool
 from ifo_grounding.transforms.choosing import PoolScorer
@@ -80,7 +80,7 @@ def select_pairs(
     found: list[TensorDict] = []
     count = seen = resets = 0
     best_score = 0.0
-    with tqdm(total=n, desc="pairs", disable=not progress) as bar:
+    with progress_bar(total=n, desc="pairs", shown=progress) as bar:
         while count < n:
             pixels = env.reset()[PIXELS].flatten(0, -4)
             choices = scorer.choose(

@@ -10,12 +10,15 @@ import platform
 import shutil
 import time
 import uuid
+import warnings
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.files import atomic_write, home, read_json, write_json
+from ifo_grounding.files import atomic_write, home, read_json, remove_leftovers, write_json
 from ifo_grounding.machine import processor
 from ifo_grounding.training.checkpoint import difference, spent
 from ifo_grounding.training.loop import Log, Metrics
@@ -28,6 +31,10 @@ TAKEN = ".taken"
 """Folder for what is copied from another run, until all of it has its place."""
 NOT_TAKEN = (OPTIONS, "logs", "checkpoints", "report", "result.json", ".*")
 """What :meth:`Run.take_over` never copies."""
+WRITTEN = ("stages", "metrics", "logs", "report", "report/pictures", "checkpoints/*")
+"""Folders in a run's folder in which files are written."""
+_HELD: set[Path] = set()
+"""Folders of the runs that this process has locked."""
 
 
 class Run:
@@ -73,29 +80,45 @@ class Run:
     def lock(self) -> Iterator[None]:
         """Keep other processes out of the run while the block lasts, and remove unfinished files.
 
-        The lock dies with this process, which may take it again.
+        The lock dies with this process, which may take it again. A file system without locks gets
+        a warning.
 
         Raises:
             UserError: where another process holds the lock, with its number, machine and time.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        me = f"process {os.getpid()} on {platform.node()}"
-        with (self / ".lock").open("a+") as file:
+        if (folder := self.folder.resolve()) in _HELD:
+            yield
+            return
+        with (folder / ".lock").open("a+") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                file.truncate(0)
-                print(me, "since", time.strftime("%Y-%m-%d %H:%M:%S"), file=file, flush=True)
-                for stale in [*self.folder.rglob(".*.tmp")]:
-                    shutil.rmtree(stale) if stale.is_dir() else stale.unlink(missing_ok=True)
             except BlockingIOError:
                 file.seek(0)
-                holder = file.read().strip()
-                if not holder.startswith(f"{me} "):
-                    raise UserError(
-                        f"the run {self.name} is in use by {holder or 'another process'}: wait "
-                        "until it ends, or give another run="
-                    ) from None
-            yield
+                raise UserError(
+                    f"the run {self.name} is in use by {file.read().strip() or 'another process'}: "
+                    "wait until it ends, or give another run="
+                ) from None
+            except OSError as error:
+                warnings.warn(f"{folder} has no lock ({error}): work on it alone", stacklevel=3)
+            else:
+                remove_leftovers(folder, *(path for name in WRITTEN for path in folder.glob(name)))
+            file.truncate(0)
+            me = f"process {os.getpid()} on {platform.node()}"
+            print(me, "since", time.strftime("%Y-%m-%d %H:%M:%S"), file=file, flush=True)
+            _HELD.add(folder)
+            try:
+                yield
+            finally:
+                _HELD.remove(folder)
+
+    def drop_if_empty(self) -> None:
+        """Remove a run that a command began and made nothing of."""
+        if {path.name for path in self.folder.glob("*")} <= {OPTIONS, ".lock"}:
+            for name in (OPTIONS, ".lock"):
+                (self / name).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a folder of others, or the current one
+                self.folder.rmdir()
 
     def options(self) -> dict[str, Any] | None:
         """Return the options that the run was made with, None where it has not begun.
@@ -143,7 +166,12 @@ class Run:
     def record(self, name: str) -> dict[str, Any]:
         """Return what a stage left when it was done, empty where it was not."""
         path = self._record_path(name)
-        return read_json(path) if path.exists() else {}
+        return read_json(path, dict, ["result", "seconds"]) if path.exists() else {}
+
+    def records(self) -> dict[str, dict[str, Any]]:
+        """Return what each stage that is done left."""
+        names = sorted(path.stem for path in self.folder.glob("stages/*.json"))
+        return {name: self.record(name) for name in names}
 
     def _record_path(self, name: str) -> Path:
         return self / f"stages/{name}.json"
@@ -229,6 +257,7 @@ class Stage:
         if history is not None:
             write_json(self.run / f"metrics/{self.name}.json", list(history))
         record = {"result": result, "seconds": seconds, "machine": machine or processor()}
+        record["threads"] = torch.get_num_threads()
         write_json(self.run._record_path(self.name), record)
         self._drop_checkpoints()
         self.result = result
@@ -247,20 +276,21 @@ class Stage:
         if self.run.logger == "wandb":  # one run there for all stages of this folder
             if not (drawn := folder / "wandb-id.json").exists():
                 write_json(drawn, uuid.uuid4().hex[:8])
-            options = {"wandb_kwargs": {"project": "ifo-grounding", "id": read_json(drawn)}}
+            named = {"project": "ifo-grounding", "id": read_json(drawn, str)}
+            options = {"wandb_kwargs": {**named, "reinit": True}}  # jobs of one process have theirs
             name = self.run.folder.resolve().name
         logger: Any = get_logger(self.run.logger, str(folder), name, **options)
         mark = folder / f"{self.name}-step.json"
-        last = read_json(mark) if mark.exists() else -1
+        last = read_json(mark, int) if mark.exists() else -1
 
         def log(metrics: Metrics, step: int) -> None:
             if step <= last:
                 return
+            write_json(mark, step)  # first: a kill leaves a step out rather than log it twice
             for key, value in metrics.items():
                 logger.log_scalar(f"{self.name}/{key}", value, step=step)
             if self.run.logger == "tensorboard":
                 logger.experiment.flush()  # before the checkpoint that these steps are in
-            write_json(mark, step)
 
         return log
 
