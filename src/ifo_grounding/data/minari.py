@@ -13,10 +13,12 @@ import numpy as np
 from gymnasium import spaces
 from tqdm import tqdm
 
+from ifo_grounding.channels import channels_first
 from ifo_grounding.data._episodes import Episode
-from ifo_grounding.data._images import MODES, open_image
+from ifo_grounding.data._images import open_image
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import rgb, written_sentences
+from ifo_grounding.envs.reading import text_of
 from ifo_grounding.errors import UserError, optional
 from ifo_grounding.files import atomic_write, regular_file
 
@@ -92,10 +94,10 @@ def _episodes(
             frames = _decoded(read(number, OBSERVED, image), shown, storage.jpeg_encoding)
             truncated, terminated = (np.any(read(number, name, None)) for name in ENDS)
             if instruction in known:
-                said = {_text(text) for text in read(number, OBSERVED, instruction)}
+                said = {text_of(text) for text in read(number, OBSERVED, instruction)}
             else:
                 facts = common | next(iter(storage.get_episode_metadata([number])))
-                said = {_text(facts[instruction])} if instruction in facts else set()
+                said = {text_of(facts[instruction])} if instruction in facts else set()
         except (OSError, KeyError, ValueError) as error:
             raise UserError(f"episode {number} cannot be read ({error})") from None
         if not said:
@@ -110,14 +112,10 @@ def _episodes(
         yield number, frames, said.pop(), bool(truncated and not terminated)
 
 
-def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
-
-
 def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
     """Return images as they were before they were stored, in the order [T + 1, C, H, W].
 
-    Orders are told apart as ``from_gymnasium`` does; what is neither stays as it is.
+    Orders are told apart as ``from_gymnasium`` does; what is no image stays as it is.
     """
     from minari.dataset.minari_storage import is_image_space
 
@@ -125,11 +123,7 @@ def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
         frames = np.stack([np.asarray(open_image(bytes(row))) for row in rows])
     else:
         frames = np.stack(rows).reshape(-1, *space.shape)
-    if frames.ndim == 3:
-        return frames[:, None]
-    if frames.ndim == 4 and frames.shape[-1] in MODES and frames.shape[1] not in MODES:
-        return frames.transpose(0, 3, 1, 2)
-    return frames
+    return channels_first(frames) if frames.ndim > 2 else frames
 
 
 @contextlib.contextmanager

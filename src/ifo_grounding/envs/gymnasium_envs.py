@@ -248,6 +248,7 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         check_choice("render mode", render_mode, (None, *self.metadata["render_modes"]))
         self.render_mode = render_mode
         self._worlds = PickAndPlaceVectorEnv(task, 1, **options)
+        self._row = torch.zeros(1, dtype=torch.int64, device=self._worlds._simulator.device)
         self.observation_space = self._worlds.single_observation_space
         self.action_space = self._worlds.single_action_space
         self._window = Window(RENDER_FPS) if render_mode == "human" else None
@@ -257,11 +258,16 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin the next episode of the stream, or the first one of ``seed``."""
         super().reset(seed=seed)
-        self._worlds.np_random = self.np_random
-        observations, infos = self._worlds.reset(seed=seed, options=options)
+        worlds, simulator = self._worlds, self._worlds._simulator
+        worlds.np_random = self.np_random
+        if options or seed is not None or not simulator.started:
+            worlds.reset(seed=seed, options=options)
+        else:  # without masks, a sixth faster
+            simulator.reset(self._row)
+            worlds._texts[:] = VOCABULARY.decode(simulator.instruction.cpu())
         self._show()
-        first = {name: value[0] for name, value in observations.items()}
-        return first, {TEXT: infos[TEXT][0]}
+        observation = {name: value[0] for name, value in worlds._observe().items()}
+        return observation, {TEXT: worlds._texts[0]}
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action, 0..5."""
