@@ -30,6 +30,7 @@ from ifo_grounding.data import (
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.files import read_json
 from ifo_grounding.objectives import ImitationLoss
+from ifo_grounding.seeding import Lots
 from ifo_grounding.tasks import grammar
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.transforms import InstructionSampler
@@ -71,7 +72,7 @@ def ours(work: Callable[[], float]) -> dict[str, Once]:
 
 def world_step() -> Row:
     batch, steps = 4096, 200
-    first = random_layout(batch, device=DEVICE)
+    first = random_layout(Lots(0, torch.arange(batch, device=DEVICE)))
     actions = torch.randint(6, (steps, batch), device=DEVICE)
 
     def walk(state: WorldState, some: torch.Tensor) -> WorldState:
@@ -105,7 +106,7 @@ def world_step() -> Row:
 
 def world_pixels() -> Row:
     batch, steps = 1024, 40
-    first = random_layout(batch, device=DEVICE)
+    first = random_layout(Lots(0, torch.arange(batch, device=DEVICE)))
     actions = torch.randint(6, (steps, batch), device=DEVICE)
     table = tile_table().to(DEVICE)
 
@@ -152,16 +153,13 @@ def env_rollout() -> Row:
         return batch * steps * times
 
     def simulate() -> float:
-        rows = torch.arange(batch, device=DEVICE)
         for _ in range(times):
-            bare._simulator.reset(rows)
+            bare._simulator.reset()
             for action in torch.randint(6, (steps, batch), device=DEVICE):
                 _, terminated, truncated = bare._simulator.step(action)
                 bare._simulator.pixels()
-                ended = (terminated | truncated).nonzero().squeeze(-1)
-                if len(ended):
-                    bare._simulator.reset(ended)
-                    bare._simulator.pixels()
+                bare._simulator.reset(terminated | truncated)
+                bare._simulator.pixels()
         return batch * steps * times
 
     return Row(
@@ -431,7 +429,7 @@ def whole() -> Row:
 
 def growth() -> Row:
     def play(batch: int, size: int) -> Callable[[], object]:
-        state = random_layout(batch, Layout(size=size), device=DEVICE)
+        state = random_layout(Lots(0, torch.arange(batch, device=DEVICE)), Layout(size=size))
         action = torch.randint(6, (batch,), device=DEVICE)
 
         def work() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
 
@@ -100,3 +101,29 @@ def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
     here = losses("cpu")
     with pretended_gpu():
         assert losses("cuda") == pytest.approx(here, abs=1e-4)
+
+
+class Asking(TorchDispatchMode):
+    """Notes the operations by which a program waits for a GPU."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.noted: set[str] = set()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.noted.add(function.overloadpacket.__name__)
+        return function(*args, **(kwargs or {}))
+
+
+def test_a_step_and_a_reset_ask_a_gpu_nothing():
+    with pretended_gpu():
+        simulator = PickAndPlaceEnv("pick", num_envs=8, seed=0, device="cuda")._simulator
+        actions = torch.randint(6, (12, 8), device="cuda")
+        simulator.reset()
+        with Asking() as asking:
+            for action in actions:
+                _, terminated, truncated = simulator.step(action)
+                simulator.pixels()
+                simulator.reset(terminated | truncated)
+    assert "where" in asking.noted and simulator.numbers.max() > 7
+    assert not asking.noted & {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "unique"}

@@ -7,6 +7,7 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import networks
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.seeding import Lots
 from ifo_grounding.tasks import SceneOptions, SceneStream
 from ifo_grounding.world import random_layout, render, step, tile_index, tile_table
 from ifo_grounding.world.dynamics import PICK_PLACE, neighbour
@@ -25,7 +26,7 @@ def times_as_fast(fast, plain, repeats=15) -> float:
 
 
 def test_drawing_beats_whole_tiles():
-    state, table = random_layout(1024), tile_table()
+    state, table = random_layout(Lots(0, torch.arange(1024))), tile_table()
 
     def plain():
         tiles = table[tile_index(state).long()]
@@ -36,7 +37,7 @@ def test_drawing_beats_whole_tiles():
 
 
 def test_a_step_beats_the_rules_written_out():
-    state, action = random_layout(32_768), torch.randint(6, (32_768,))
+    state, action = random_layout(Lots(0, torch.arange(32_768))), torch.randint(6, (32_768,))
 
     def plain():
         arm = neighbour(state.arm, action, state.size)[0]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,21 +31,64 @@ def generator(
     return torch.Generator(device=device or "cpu").manual_seed(derive(seed, *names))
 
 
-Generators = torch.Generator | Sequence[torch.Generator] | None
-"""Where random rows come from: one generator (None is the global one), or several in turn."""
+def _signed(bits: int) -> int:
+    return bits - (1 << 64) if bits >> 63 else bits
 
 
-def draw_rows(
-    draw: Callable[..., Tensor], shape: Sequence[int], source: Generators, **options: Any
-) -> Tensor:
-    """Return ``draw(shape, generator=source)``; of several generators each draws its share of rows.
+_GOLDEN, *_FACTORS = map(_signed, (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
-    >>> pair = [generator(0, "left"), generator(0, "right")]
-    >>> rows = draw_rows(torch.rand, (6, 2), pair)
-    >>> bool((rows[3:] == torch.rand(3, 2, generator=generator(0, "right"))).all())
+
+def _mixed(bits: Tensor) -> Tensor:
+    """Return splitmix64 of int64 (Steele, Lea and Flood 2014); products wrap on every device."""
+    bits = (bits ^ (bits >> 30 & (1 << 34) - 1)) * _FACTORS[0]
+    bits = (bits ^ (bits >> 27 & (1 << 37) - 1)) * _FACTORS[1]
+    return bits ^ (bits >> 31 & (1 << 33) - 1)
+
+
+class Lots:
+    """Random whole numbers for N rows: the same bits on every device, whatever the rows beside.
+
+    A number depends on the key, on the row's counters and on how many its row drew before.
+
+    Args:
+        key: seed, such as :func:`derive` returns.
+        counters: what tells rows apart, int64 [N] each.
+
+    >>> both = Lots(0, torch.tensor([7, 8])).below(6, 4)
+    >>> bool((both[1:] == Lots(0, torch.tensor([8])).below(6, 4)).all())
     True
     """
-    if source is None or isinstance(source, torch.Generator):
-        return draw(shape, generator=source, **options)
-    share = (shape[0] // len(source), *shape[1:])
-    return torch.cat([draw(share, generator=each, **options) for each in source])
+
+    def __init__(self, key: int, *counters: Tensor) -> None:
+        self._row = torch.full_like(counters[0], key)
+        for counter in counters:
+            self._row = _mixed(self._row + (counter + 1) * _GOLDEN)
+        self._drawn = 0
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self._row)
+
+    @property
+    def device(self) -> torch.device:
+        """Where numbers are drawn."""
+        return self._row.device
+
+    def below(self, end: int | Tensor, n: int = 1) -> Tensor:
+        """Draw n numbers of 0..end - 1 for each row, int64 [N, n]; ``end`` < 2^31 broadcasts."""
+        places = torch.arange(self._drawn + 1, self._drawn + n + 1, device=self.device)
+        self._drawn += n
+        bits = _mixed(self._row.unsqueeze(-1) + places * _GOLDEN)
+        return (bits >> 32 & (1 << 32) - 1) * end >> 32
+
+    def distinct(self, end: int, n: int) -> Tensor:
+        """Draw n different numbers of 0..end - 1 for each row, int64 [N, n] (Fisher and Yates)."""
+        small = torch.uint8 if end <= 256 else torch.int64
+        left = torch.arange(end, dtype=small, device=self.device).repeat(len(self), 1)
+        turns = torch.arange(n, device=self.device)
+        places = turns + self.below(end - turns, n)
+        for turn in range(n):
+            place, first = places[:, turn : turn + 1], left[:, turn : turn + 1].clone()
+            left[:, turn : turn + 1] = left.gather(1, place)
+            left.scatter_(1, place, first)
+        return left[:, :n].long()

@@ -10,9 +10,10 @@ from torchrl.envs import Compose
 
 from ifo_grounding.data import FrameCodec, FrameDecoder
 from ifo_grounding.data.decoding import Lookup
+from ifo_grounding.seeding import Lots
 from ifo_grounding.world import random_layout, render
 
-FRAMES = render(random_layout(40, generator=torch.Generator().manual_seed(0)))
+FRAMES = render(random_layout(Lots(0, torch.arange(40))))
 CODEC, CODES = FrameCodec.compress(FRAMES, tile_size=8)
 
 

@@ -24,6 +24,7 @@ from ifo_grounding.data import (
     to_minari,
 )
 from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import Lots
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 from ifo_grounding.world import random_layout, render
 
@@ -33,8 +34,8 @@ SENTENCES = ["go up", "go left", "go up", "take it"]
 
 def episodes(seed: int = 0) -> list[torch.Tensor]:
     """Frames of four episodes, all different."""
-    draw = torch.Generator().manual_seed(seed)
-    return list(render(random_layout(sum(LENGTHS), generator=draw)).split(LENGTHS))
+    lots = Lots(seed, torch.arange(sum(LENGTHS)))
+    return list(render(random_layout(lots)).split(LENGTHS))
 
 
 def made(frames: list[torch.Tensor], tile_size: int | None = None) -> Demonstrations:

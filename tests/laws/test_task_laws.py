@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ifo_grounding.seeding import Lots
 from ifo_grounding.tasks import REASONS, TASKS, achieved, plan, verdict
 from ifo_grounding.tasks.expert import act
 from ifo_grounding.world import Layout, random_layout, step
@@ -24,7 +25,7 @@ def asked(draw):
     most = min(size * size - 4, 14)
     low = draw(st.integers(1, most))
     layout = Layout(size=size, objects=(low, draw(st.integers(low, most))), boxes=(0, 4))
-    state = random_layout(ROWS, layout, generator=torch.Generator().manual_seed(seed))
+    state = random_layout(Lots(seed, torch.arange(ROWS)), layout)
     return state, draw_goal(task, state, seed, present=draw(st.floats(0, 1)))
 
 

@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ifo_grounding.seeding import Lots
 from ifo_grounding.world import Layout, WorldState, random_layout, step
 from ifo_grounding.world.dynamics import PICK_PLACE, STOP
 from reference import LETTERS, act, plain, worlds
@@ -21,8 +22,9 @@ def walked(draw) -> WorldState:
     low = draw(st.integers(0, most))
     objects, boxes = (low, draw(st.integers(low, most))), (0, draw(st.integers(0, 3)))
     layout = Layout(size, objects, boxes, inside=draw(st.floats(0, 1)))
-    generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
-    state = random_layout(ROWS, layout, generator=generator)
+    seed = draw(st.integers(0, 2**31))
+    generator = torch.Generator().manual_seed(seed)
+    state = random_layout(Lots(seed, torch.arange(ROWS)), layout)
     for _ in range(draw(st.integers(0, 12))):
         actions = torch.randint(6, (ROWS,), generator=generator)
         state = step(state, torch.where(actions == STOP, PICK_PLACE, actions))

@@ -4,12 +4,13 @@ import pytest
 import torch
 
 from ifo_grounding.networks import ConvEncoder, PatchEncoder, patches
+from ifo_grounding.seeding import Lots
 from ifo_grounding.world import random_layout, render
 
 
 @pytest.fixture
 def images():
-    return render(random_layout(64, generator=torch.Generator().manual_seed(0)))
+    return render(random_layout(Lots(0, torch.arange(64))))
 
 
 @pytest.fixture(params=[lambda: ConvEncoder(3, 8, 4), lambda: PatchEncoder(3, 8, 8)])

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ifo_grounding.keys import ACTIONS
+from ifo_grounding.seeding import Lots
 from ifo_grounding.world import neighbour, random_layout, step
 from ifo_grounding.world.dynamics import DOWN, LEFT, PICK_PLACE, RIGHT, STOP, UP
 from reference import LETTERS, Plain, plain, worlds
@@ -50,7 +51,10 @@ def test_steps_by_hand(before, actions, after):
 
 def test_steps_of_any_batch_shape_are_steps_of_its_rows():
     draw = torch.Generator().manual_seed(0)
-    state, actions = random_layout(12, generator=draw), torch.randint(6, (12,), generator=draw)
+    state, actions = (
+        random_layout(Lots(0, torch.arange(12))),
+        torch.randint(6, (12,), generator=draw),
+    )
     together = step(state.reshape(3, 4), actions.reshape(3, 4))
     assert together.batch_size == torch.Size([3, 4])
     assert (together.reshape(12) == step(state, actions)).all()

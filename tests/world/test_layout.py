@@ -5,15 +5,15 @@ import torch
 from scipy import stats
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import Lots
 from ifo_grounding.world import Layout, random_layout
-from ifo_grounding.world.layout import highest
 
 N = 20_000
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    return random_layout(N, generator=torch.Generator().manual_seed(0))
+    return random_layout(Lots(0, torch.arange(N)))
 
 
 def uniform(counts: torch.Tensor) -> float:
@@ -55,23 +55,23 @@ def test_about_a_third_of_the_objects_starts_inside_a_box(drawn):
     # 0.35 where boxes are free; with 2-4 boxes for 4-8 objects they sometimes run out.
     assert 0.28 < share < 0.35
     plenty = Layout(objects=(1, 1), boxes=(3, 3))
-    alone = random_layout(N, plenty, generator=torch.Generator().manual_seed(1))
+    alone = random_layout(Lots(1, torch.arange(N)), plenty)
     share = ((alone.objects > 0) & (alone.boxes > 0)).sum() / N
     assert abs(share - 0.35) < 4 * (0.35 * 0.65 / N) ** 0.5
 
 
 def test_the_share_inside_boxes_can_be_chosen():
-    never = random_layout(500, Layout(inside=0.0), generator=torch.Generator().manual_seed(0))
+    never = random_layout(Lots(0, torch.arange(500)), Layout(inside=0.0))
     assert not ((never.objects > 0) & (never.boxes > 0)).any()
     always = Layout(objects=(3, 3), boxes=(3, 3), inside=1.0)
-    state = random_layout(500, always, generator=torch.Generator().manual_seed(0))
+    state = random_layout(Lots(0, torch.arange(500)), always)
     assert ((state.objects > 0) == (state.boxes > 0)).all()
 
 
 @pytest.mark.parametrize("size", [3, 10])
 def test_grids_of_other_sizes(size):
     layout = Layout(size=size, objects=(2, 5), boxes=(1, 4))
-    state = random_layout(300, layout, generator=torch.Generator().manual_seed(size))
+    state = random_layout(Lots(size, torch.arange(300)), layout)
     assert state.size == size
     objects, boxes = (state.objects > 0).sum(-1), (state.boxes > 0).sum(-1)
     assert (objects.min(), objects.max(), boxes.min(), boxes.max()) == (2, 5, 1, 4)
@@ -96,19 +96,36 @@ def test_an_impossible_layout_is_refused(wrong, said):
         Layout(**wrong)
 
 
-@pytest.mark.parametrize("cells", [9, 36, 256])
-@pytest.mark.parametrize("values", [2**24, 2**5], ids=["distinct", "many alike"])
-def test_places_are_drawn_as_topk_draws_them(cells, values):
-    draw = torch.Generator().manual_seed(0)
-    lots = torch.randint(values, (5000, cells), generator=draw) / values
-    for k in (1, 8, cells):
-        assert torch.equal(highest(lots, k), lots.topk(k).indices)
-    assert highest(lots, 0).shape == (5000, 0)
+def test_lots_are_those_of_splitmix64():
+    def mixed(bits: int) -> int:
+        bits = ((bits ^ bits >> 30) * 0xBF58476D1CE4E5B9) % 2**64
+        bits = ((bits ^ bits >> 27) * 0x94D049BB133111EB) % 2**64
+        return bits ^ bits >> 31
+
+    step, lots = 0x9E3779B97F4A7C15, Lots(7, torch.tensor([0, 41]), torch.tensor([3, 5]))
+    drawn = [*lots.below(2**31 - 1, 3).unbind(1), *lots.below(10).unbind(1)]
+    for row, counters in enumerate([(0, 3), (41, 5)]):
+        state = 7
+        for counter in counters:
+            state = mixed((state + (counter + 1) * step) % 2**64)
+        bits = [mixed((state + turn * step) % 2**64) >> 32 for turn in (1, 2, 3, 4)]
+        ends = [2**31 - 1] * 3 + [10]
+        expected = [bit * end >> 32 for bit, end in zip(bits, ends, strict=True)]
+        assert [int(column[row]) for column in drawn] == expected
+
+
+@pytest.mark.parametrize(("end", "n"), [(3, 3), (4, 2), (300, 300), (5, 0)])
+def test_distinct_lots_are_permutations_each_as_likely(end, n):
+    drawn = Lots(1, torch.arange(6000)).distinct(end, n)
+    assert drawn.shape == (6000, n) and (drawn.sort(1).values.diff(dim=1) > 0).all()
+    if n and end < 10:
+        _, counts = drawn.unique(dim=0, return_counts=True)
+        assert len(counts) == 6 * (end - 2) and uniform(counts) > 1e-4
 
 
 def test_worlds_do_not_depend_on_the_default_dtype():
     def drawn():
-        return random_layout(100, generator=torch.Generator().manual_seed(0))
+        return random_layout(Lots(0, torch.arange(100)))
 
     usual = drawn()
     torch.set_default_dtype(torch.float64)

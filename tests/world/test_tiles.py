@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.seeding import Lots
 from ifo_grounding.world import (
     Canvas,
     WorldState,
@@ -53,7 +54,7 @@ def test_tiles_differ_in_whole_pixels_and_not_in_shades(size):
 @sizes
 def test_a_frame_is_the_mosaic_of_its_cells(size):
     draw = torch.Generator().manual_seed(size)
-    state = random_layout(5, generator=draw)
+    state = random_layout(Lots(0, torch.arange(5)))
     for _ in range(8):
         state = step(state, torch.randint(5, (5,), generator=draw))
     shown = render(state, size).unflatten(-1, (6, size)).unflatten(-3, (6, size))
@@ -87,12 +88,12 @@ def test_an_unknown_tile_size_is_refused():
 @sizes
 @pytest.mark.parametrize("worlds", [8, 232])  # drawn anew, and where cells changed
 def test_a_canvas_shows_what_is_rendered(size, worlds):
-    canvas, state = Canvas(size), random_layout(worlds)
+    canvas, state = Canvas(size), random_layout(Lots(0, torch.arange(worlds)))
     for turn in range(8):
         if turn == 4:  # some worlds begin anew, and then all of them
-            state[: worlds // 8] = random_layout(worlds // 8)
+            state[: worlds // 8] = random_layout(Lots(1, torch.arange(worlds // 8)))
         if turn == 6:
-            state = random_layout(worlds)
+            state = random_layout(Lots(2, torch.arange(worlds)))
         drawn = canvas.draw(state)
         assert torch.equal(drawn, render(state, size))
         drawn.zero_()  # is the caller's own

@@ -18,7 +18,6 @@ from ifo_grounding.data._episodes import Episode
 from ifo_grounding.data._images import open_image
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.pictures import rgb, written_sentences
-from ifo_grounding.envs.reading import text_of
 from ifo_grounding.errors import UserError, optional
 from ifo_grounding.files import atomic_write, regular_file
 
@@ -94,10 +93,10 @@ def _episodes(
             frames = _decoded(read(number, OBSERVED, image), shown, storage.jpeg_encoding)
             truncated, terminated = (np.any(read(number, name, None)) for name in ENDS)
             if instruction in known:
-                said = {text_of(text) for text in read(number, OBSERVED, instruction)}
+                said = {_text(text) for text in read(number, OBSERVED, instruction)}
             else:
                 facts = common | next(iter(storage.get_episode_metadata([number])))
-                said = {text_of(facts[instruction])} if instruction in facts else set()
+                said = {_text(facts[instruction])} if instruction in facts else set()
         except (OSError, KeyError, ValueError) as error:
             raise UserError(f"episode {number} cannot be read ({error})") from None
         if not said:
@@ -110,6 +109,10 @@ def _episodes(
                 f"episode {number} has {len(said)} instructions: a demonstration follows one"
             )
         yield number, frames, said.pop(), bool(truncated and not terminated)
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:

@@ -64,25 +64,19 @@ class NumberedEnv(EnvBase):
         flags = {name: Binary(1, dtype=torch.bool, **flag) for name in DONE}
         self.done_spec = Composite(flags, **on)
 
-    def _asked(
-        self, tensordict: TensorDictBase | None, started: bool
-    ) -> tuple[Tensor, Tensor | None]:
-        """Return the rows that begin an episode, int64 [R], and the scenes asked for there."""
+    def _asked(self, tensordict: TensorDictBase | None) -> tuple[Tensor | None, Tensor | None]:
+        """Return where episodes begin, None for everywhere, and the scenes asked for there."""
         given: Any = {} if tensordict is None else tensordict
-        mask = given.get("_reset", None)
-        if mask is None or not started:
-            rows = torch.arange(self.num_envs, device=self.device)
-        else:
-            rows = mask.reshape(self.num_envs).nonzero().squeeze(-1)
-        numbers = given.get(keys.SCENE, None)
+        mask, numbers = given.get("_reset", None), given.get(keys.SCENE, None)
+        mask = None if mask is None else mask.reshape(self.num_envs)
         if numbers is None:
-            return rows, None
+            return mask, None
         if numbers.is_floating_point() or numbers.dtype == torch.bool:
             raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
-        numbers = numbers.reshape(self.num_envs)[rows].long()
-        if len(numbers) and int(numbers.min()) < 0:
+        numbers = numbers.reshape(self.num_envs).long()
+        if bool(((numbers < 0) & (True if mask is None else mask)).any()):
             raise UserError("scene numbers start at 0")
-        return rows, numbers
+        return mask, numbers
 
     def _wish(self, tensordict: TensorDictBase | None) -> Tensor | None:
         """Return the instructions that a reset asks for; those of an observation are over."""

@@ -192,7 +192,7 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         """Begin new episodes where ``mask``, with the given scenes [num_envs] or the next ones."""
         if not mask.any():
             return
-        rows = torch.from_numpy(np.flatnonzero(mask)).to(self._simulator.device)
+        begins = torch.tensor(mask, device=self._simulator.device)
         numbers = None
         if scenes is not None:
             given = np.atleast_1d(np.asarray(scenes))
@@ -200,9 +200,9 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
                 raise UserError(
                     f"options['scene'] must be integers, one for each of {self.num_envs} worlds"
                 )
-            numbers = torch.from_numpy(given.astype(np.int64)[mask]).to(self._simulator.device)
-        self._simulator.reset(rows, numbers)
-        self._texts[mask] = VOCABULARY.decode(self._simulator.instruction[rows].cpu())
+            numbers = torch.from_numpy(given.astype(np.int64)).to(self._simulator.device)
+        self._simulator.reset(begins, numbers)
+        self._texts[mask] = VOCABULARY.decode(self._simulator.instruction[begins].cpu())
         self._ended = self._ended & ~mask
 
     def _final(
@@ -248,7 +248,6 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         check_choice("render mode", render_mode, (None, *self.metadata["render_modes"]))
         self.render_mode = render_mode
         self._worlds = PickAndPlaceVectorEnv(task, 1, **options)
-        self._row = torch.zeros(1, dtype=torch.int64, device=self._worlds._simulator.device)
         self.observation_space = self._worlds.single_observation_space
         self.action_space = self._worlds.single_action_space
         self._window = Window(RENDER_FPS) if render_mode == "human" else None
@@ -263,7 +262,7 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
         if options or seed is not None or not simulator.started:
             worlds.reset(seed=seed, options=options)
         else:  # without masks, a sixth faster
-            simulator.reset(self._row)
+            simulator.reset()
             worlds._texts[:] = VOCABULARY.decode(simulator.instruction.cpu())
         self._show()
         observation = {name: value[0] for name, value in worlds._observe().items()}

@@ -128,7 +128,7 @@ class PickAndPlaceEnv(NumberedEnv):
     @property
     def scene_numbers(self) -> Tensor:
         """Number of the scene that each row began with, int64 [num_envs]."""
-        return self._simulator.numbers
+        return self._simulator.numbers.clone()
 
     @property
     def truth(self) -> Scene:
@@ -160,9 +160,11 @@ class PickAndPlaceEnv(NumberedEnv):
         return Composite(parts, shape=self.batch_size, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        rows, numbers = self._asked(tensordict, self._simulator.started)
-        self._simulator.reset(rows, numbers)
+        mask, numbers = self._asked(tensordict)
+        self._simulator.reset(mask, numbers)
         if (tokens := self._wish(tensordict)) is not None:
+            every = torch.arange(self.num_envs, device=self.device)
+            rows = every if mask is None else every[mask]
             self._simulator.ask(rows, tokens[rows])
         result = self._observe()
         for name in DONE:

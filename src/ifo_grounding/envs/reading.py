@@ -45,15 +45,6 @@ def _wrapper_of(space: gymnasium.Space) -> str:
     return f"gymnasium.wrappers.TransformAction(world, lambda a: {chosen}, Discrete({count})){said}"
 
 
-def text_of(said: object) -> str:
-    """Return an instruction that a world or a file says, text or bytes."""
-    if isinstance(said, bytes):
-        return said.decode()
-    if not isinstance(said, str):
-        raise UserError(f"an instruction is text, got {type(said).__name__} {said!r:.40}")
-    return said
-
-
 class Reading(gymnasium.Wrapper):
     """One world whose image and instruction are arrays of fixed sizes, which can be batched.
 
@@ -177,11 +168,13 @@ class Reading(gymnasium.Wrapper):
         return channels_first(picture[None])[0]
 
     def _said(self, observation: Any, info: Any) -> str | None:
-        for part in (observation, info):
-            if isinstance(part, dict) and self.instruction in part:
-                said = part[self.instruction]  # a tuple of stacked observations: the last one's
-                return text_of(said[-1] if isinstance(said, tuple) and said else said)
-        return None
+        """Return the instruction that is said, of stacked observations the last one's."""
+        found = [part for part in (observation, info) if self.instruction in _names(part)]
+        said: Any = found[0][self.instruction] if found else None
+        said = said[-1] if isinstance(said, tuple) and said else said
+        if found and not isinstance(said, str | bytes):
+            raise UserError(f"an instruction is text, got {type(said).__name__} {said!r:.40}")
+        return said.decode() if isinstance(said, bytes) else said
 
 
 def _names(source: Any) -> list[str]:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.tasks.goals import Plan, fulfilled, plan
+from ifo_grounding.tasks.goals import fulfilled, plan
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.tasks.scenes import Scene, SceneOptions, leaves
+from ifo_grounding.tasks.scenes import FEWEST, Scene, SceneOptions, draw_scenes, leaves
 from ifo_grounding.tasks.streams import SceneStream
 from ifo_grounding.world import Canvas, WorldState, render, step
 from ifo_grounding.world.tiles import TILE_SIZES
 
 RENDER_TILE_SIZE = 32
 """Pixels along one side of a cell in pictures for people."""
+AHEAD = 16
+"""Resets of all rows for which scenes are drawn ahead; then a GPU is asked how many have begun."""
+CHUNK = 1 << 17
+"""Most scenes that are drawn at once, for memory's sake."""
 
 
 def check_actions(action: Tensor, worlds: int, count: int) -> None:
@@ -41,8 +48,8 @@ def check_actions(action: Tensor, worlds: int, count: int) -> None:
 class Simulator:
     """Runs ``num_envs`` episodes of numbered scenes side by side.
 
-    What it keeps is no inference tensor, so that episodes go on outside ``torch.inference_mode``
-    that began inside.
+    What it keeps is written in place, so that a step with its reset can be one CUDA graph, and is
+    no inference tensor: episodes go on outside ``torch.inference_mode`` that began inside.
 
     Raises:
         UserError: on an impossible number or size.
@@ -65,68 +72,112 @@ class Simulator:
         self.device = torch.device(device or "cpu")
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self.numbers = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
-        self._episodes: _Episodes | None = None
+        self._leaves: list[Tensor] = []
         self._canvas = Canvas(tile_size)
         self.seed(seed)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy is made of: its scene consists of its own leaves."""
+        return {name: value for name, value in vars(self).items() if name != "scene"}
+
+    @torch.inference_mode(False)
     def seed(self, seed: int) -> None:
         """Go to the first scene of the stream of this seed."""
         self.stream = SceneStream(self.options, seed, self.device)
-        self.next_number = 0
+        self._next = torch.zeros((), dtype=torch.int64, device=self.device)
+        self._ahead: list[Tensor] = []
+        self._drawn = self._most = 0
 
     @torch.inference_mode(False)
     def to(self, device: torch.device | str) -> Simulator:
         """Move the running episodes and all that follow to a device."""
         self.device = torch.device(device)
-        self.steps, self.numbers = self.steps.to(self.device), self.numbers.to(self.device)
-        if self._episodes is not None:
-            scene = self.scene.to(self.device)
-            self._episodes = _Episodes(scene.state, scene.wanted, scene.instruction)
+        for name in ("steps", "numbers", "_next"):
+            setattr(self, name, getattr(self, name).to(device))
+        self._leaves = [leaf.to(device) for leaf in self._leaves]
+        self._ahead = [leaf.to(device) for leaf in self._ahead]
+        vars(self).pop("scene", None)
         self._canvas = Canvas(self.tile_size)
-        self.stream = SceneStream(self.stream.options, self.stream.seed, self.device)
+        self.stream = SceneStream(self.stream.options, self.stream.seed, device)
         return self
 
     @property
     def started(self) -> bool:
         """Whether there has been a reset."""
-        return self._episodes is not None
+        return bool(self._leaves)
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """The worlds as they are, with what they are asked, [num_envs]."""
+        if not self.started:
+            raise UserError("there is no episode yet: reset the environment first")
+        return Scene.of(self._leaves)
 
     @property
     def state(self) -> WorldState:
         """The worlds as they are, [num_envs]."""
-        return self._running.state
-
-    @property
-    def scene(self) -> Scene:
-        """The worlds as they are, with what they are asked, [num_envs]."""
-        now = self._running
-        return Scene(now.state, now.wanted, now.instruction, batch_size=[self.num_envs])
+        return self.scene.state
 
     @property
     def instruction(self) -> Tensor:
         """Tokens of each row's instruction, int64 [num_envs, 16]."""
-        return self._running.instruction
-
-    @property
-    def _running(self) -> _Episodes:
-        if self._episodes is None:
-            raise UserError("there is no episode yet: reset the environment first")
-        return self._episodes
+        return self.scene.instruction
 
     @torch.inference_mode(False)
-    def reset(self, rows: Tensor, numbers: Tensor | None = None) -> None:
-        """Begin new episodes in some rows, int64 [R], by default with the stream's next scenes."""
+    def reset(self, mask: Tensor | None = None, numbers: Tensor | None = None) -> None:
+        """Begin new episodes, without asking a GPU where.
+
+        Args:
+            mask: in which rows, bool [num_envs]; in all by default, and at the first time.
+            numbers: scenes to begin with, int64 [num_envs]; the stream's next ones by default.
+        """
+        if mask is None or not self.started:
+            mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if numbers is None:
-            first = self.next_number
-            numbers = torch.arange(first, first + len(rows), device=self.device)
-            self.next_number += len(rows)
-        if self._episodes is None:
-            # Every row needs a valid scene before any of them is replaced.
-            every = self.stream.scenes(numbers[:1].expand(self.num_envs)).clone()
-            self._episodes = _Episodes(every.state, every.wanted, every.instruction)
-        self.stream.write(numbers, self._episodes.leaves(), rows)
-        self.steps[rows] = 0
-        self.numbers = self.numbers.index_copy(0, rows, numbers)  # others may hold the old ones
+            numbers, drawn = self._following(mask)
+            places = numbers % len(drawn[0])
+        else:
+            drawn = leaves(self.stream.scenes(numbers.where(mask, 0)))
+            places = torch.arange(self.num_envs, device=self.device)
+        self.steps.masked_fill_(mask, 0)
+        torch.where(mask, numbers, self.numbers, out=self.numbers)
+        if not self.started:
+            self._leaves = [source.index_select(0, places) for source in drawn]
+            return
+        if self.device.type == "cpu":  # which may be asked for the rows, and copies no others
+            rows = mask.nonzero().squeeze(-1)
+            places = places[rows]
+            for leaf, source in zip(self._leaves, drawn, strict=True):
+                leaf.index_copy_(0, rows, source.index_select(0, places))
+            return
+        for leaf, source in zip(self._leaves, drawn, strict=True):
+            new = source.index_select(0, places)
+            torch.where(mask.view(-1, *[1] * (leaf.ndim - 1)), new, leaf, out=leaf)
+
+    def _following(self, mask: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Number the stream's next scenes for the rows of a mask, int64 [num_envs], and draw them.
+
+        Returns:
+            The numbers, and the leaves of scenes drawn ahead, each at its number modulo their
+            count.
+        """
+        on_cpu = self.device.type == "cpu"
+        count = max(FEWEST, self.num_envs * (2 if on_cpu else AHEAD))
+        if self._most + self.num_envs > self._drawn:
+            first = self._most = int(self._next)
+            new = torch.arange(max(first, self._drawn), first + count, device=self.device)
+            for part in new.split(CHUNK):
+                drawn = leaves(draw_scenes(self.stream.options, self.stream.seed, part))
+                if not self._ahead:
+                    self._ahead = [leaf.new_empty(count, *leaf.shape[1:]) for leaf in drawn]
+                for leaf, rows in zip(self._ahead, drawn, strict=True):
+                    leaf.index_copy_(0, part % count, rows)
+            self._drawn = first + count
+        order = mask.cumsum(0)
+        numbers = self._next + order - 1
+        self._next += order[-1]
+        self._most += int(order[-1]) if on_cpu else self.num_envs
+        return numbers, self._ahead
 
     @torch.inference_mode(False)
     def ask(self, rows: Tensor, tokens: Tensor) -> None:
@@ -137,7 +188,8 @@ class Simulator:
         """
         goal = grammar(self.options.task).parse_tokens(tokens)
         wanted = plan(self.state[rows], goal, self.options.max_steps)
-        for leaf, new in zip(self._running.asked, [*leaves(wanted), tokens], strict=True):
+        asked = [*leaves(self.scene.wanted), self.instruction]
+        for leaf, new in zip(asked, [*leaves(wanted), tokens], strict=True):
             leaf.index_copy_(0, rows, new.to(leaf))
 
     @torch.inference_mode(False)
@@ -152,14 +204,16 @@ class Simulator:
             UserError: where actions have another shape, such as one-hot actions, or are others.
         """
         check_actions(action, self.num_envs, keys.N_ACTIONS)
-        self._running.state = state = step(self.state, action)
-        self.steps = self.steps + 1
+        state = step(self.state, action)
+        for leaf, new in zip(leaves(self.state), leaves(state), strict=True):
+            leaf.copy_(new)
+        self.steps += 1
         terminated = action == keys.STOP
         truncated = (self.steps >= self.options.max_steps) & ~terminated
         ended = terminated | truncated
         if not self.options.instructed:
             return torch.zeros_like(ended), terminated, truncated
-        return ended & fulfilled(state, self._running.wanted), terminated, truncated
+        return ended & fulfilled(state, self.scene.wanted), terminated, truncated
 
     @torch.inference_mode(False)
     def pixels(self, rows: Tensor | None = None) -> Tensor:
@@ -171,23 +225,3 @@ class Simulator:
     def frames(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
         """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
         return render(self.state, tile_size).permute(0, 2, 3, 1).cpu().numpy()
-
-
-class _Episodes:
-    """A scene for each row, whose state goes on."""
-
-    def __init__(self, state: WorldState, wanted: Plan, instruction: Tensor) -> None:
-        self.state, self.wanted, self.instruction = state, wanted, instruction
-        self.asked = [*leaves(wanted), instruction]  # written to, and never replaced
-
-    def __getstate__(self) -> tuple[WorldState, Plan, Tensor]:
-        """Return what a copy is made of. Left alone, deepcopy shares the tensors of a state."""
-        return self.state.clone(), self.wanted.clone(), self.instruction.clone()
-
-    def __setstate__(self, parts: tuple[WorldState, Plan, Tensor]) -> None:
-        """Become what was copied; what is written to has to be what is read."""
-        self.__init__(*parts)  # type: ignore[misc]
-
-    def leaves(self) -> list[Tensor]:
-        """Everything that episodes are made of, as of scenes."""
-        return [*leaves(self.state), *self.asked]

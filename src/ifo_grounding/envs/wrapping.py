@@ -167,21 +167,24 @@ class GymnasiumEnv(NumberedEnv):
         self._declare(pixels.shape, self.n_actions)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        rows, numbers = self._asked(tensordict, started=int(self.scene_numbers.min()) >= 0)
-        if len(rows):
-            if numbers is None:
+        mask, numbers = self._asked(tensordict)
+        if mask is None or int(self.scene_numbers.min()) < 0:  # all begin at the first time
+            mask = torch.ones(self.num_envs, dtype=torch.bool)
+        if len(rows := mask.cpu().nonzero().squeeze(-1)):
+            if numbers is not None:
+                numbers = numbers.cpu()[rows]
+            else:
                 numbers = torch.arange(self._next_number, self._next_number + len(rows))
                 self._next_number += len(rows)
             # A new tensor: others may hold the old one.
-            self.scene_numbers = self.scene_numbers.index_copy(0, rows.cpu(), numbers.cpu())
-            begins = np.zeros(self.num_envs, dtype=bool)
-            begins[rows.cpu()] = True
+            self.scene_numbers = self.scene_numbers.index_copy(0, rows, numbers)
             numbered = self.scene_numbers.tolist()
             seeds: Any = [world_seed(self._seed, self.stream, number) for number in numbered]
-            self._seen, _ = self._worlds.reset(seed=seeds, options={"reset_mask": begins})
+            given = {"reset_mask": mask.cpu().numpy()}
+            self._seen, _ = self._worlds.reset(seed=seeds, options=given)
         shown = self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in DONE})
         if (wish := self._wish(tensordict)) is not None:
-            self._check_instruction(wish[rows], shown[keys.INSTRUCTION][rows])
+            self._check_instruction(wish[mask], shown[keys.INSTRUCTION][mask])
         return shown
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -135,8 +135,9 @@ class Grammar:
 
     def encode(self, goal: Goal, phrasing: Tensor) -> Tensor:
         """Return the tokens of goals of the task [*B] in some wordings [*B], int64 [*B, 16]."""
-        rows = self._goal_rows[tuple(getattr(goal, name) for name in FIELDS)]
-        return self.tokens[rows * len(self.phrasings) + phrasing]
+        device = phrasing.device
+        rows = self._goal_rows.to(device)[tuple(getattr(goal, name) for name in FIELDS)]
+        return self.tokens.to(device)[rows * len(self.phrasings) + phrasing]
 
     def parse(self, sentences: str | list[str]) -> Goal:
         """Return the goal of each sentence, [N].

@@ -1,9 +1,8 @@
-"""Scenes: initial states, each with a suitable goal where asked for, and how blocks are drawn."""
+"""Scenes: initial states, each with a suitable goal where asked for, by number."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from tensordict import TensorClass
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, check_choice
-from ifo_grounding.seeding import STREAMS, Generators, draw_rows, generator
+from ifo_grounding.seeding import STREAMS, Lots, derive
 from ifo_grounding.tasks.goals import (
     MAX_STEPS,
     MOVE_UDLR,
@@ -28,12 +27,10 @@ from ifo_grounding.tasks.grammar import SPLITS, grammar, holdout_kinds, in_split
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import Layout, WorldState, random_layout
 
-CHUNK = 1024
-"""Scenes that one generator draws."""
-AHEAD = 8
-"""Chunks that are drawn side by side, in half as long as one after another."""
 PATIENCE = 1000
-"""Draws of a chunk after which a layout counts as unable to hold a suitable goal."""
+"""Draws for each scene after which a layout counts as unable to hold a suitable goal."""
+FEWEST = 4096
+"""Scenes that are drawn at once at least: fewer take as long."""
 
 
 class Scene(TensorClass):
@@ -45,6 +42,16 @@ class Scene(TensorClass):
     """The goal resolved in it, [*B]."""
     instruction: Tensor
     """Tokens of a sentence for the goal, int64 [*B, 16]."""
+
+    @classmethod
+    def of(cls, leaves: list[Tensor]) -> Scene:
+        """Return the scenes [N] whose :func:`leaves` are given."""
+        parts, shape = iter(leaves), leaves[0].shape
+        made = [
+            kind(**{each.name: next(parts) for each in fields(kind)}, batch_size=shape)
+            for kind in (WorldState, Plan)
+        ]
+        return cls(*made, next(parts), batch_size=shape)
 
 
 @dataclass(frozen=True)
@@ -97,46 +104,51 @@ class _Proposal(TensorClass):
     wording: Tensor
 
 
-def draw_block(options: SceneOptions, seed: int, block: int) -> Scene:
-    """Draw the scenes of several chunks on the CPU, so that every device gets the same ones.
+def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
+    """Draw the scenes with the given numbers, int64 [N], where the numbers lie.
+
+    A scene is the first draw of its number that has a suitable goal; without instructions the
+    first of all. It depends on nothing else, and is the same on every device.
 
     Raises:
         UserError: where hardly any scene has a suitable goal.
     """
-    numbers = range(block * AHEAD, (block + 1) * AHEAD)
-    draws = [generator(seed, "scenes", options.stream, number) for number in numbers]
-    missing = torch.full((AHEAD,), CHUNK)
-    kept: list[Any] = []
-    owners: list[Tensor] = []
-    for _ in range(PATIENCE):
-        unfinished = missing.nonzero().squeeze(-1)
-        proposal, good = _propose(options, [draws[chunk] for chunk in unfinished])
-        good &= good.cumsum(1) <= missing[unfinished].unsqueeze(1)
-        missing[unfinished] -= good.sum(1)
-        kept.append(proposal[good.flatten()])
-        owners.append(unfinished.repeat_interleave(good.sum(1)))
-        if not missing.any():
-            found: Any = torch.cat(kept)
-            return _said(found[torch.cat(owners).argsort(stable=True)], options)
-    raise UserError(
-        f"after {PATIENCE * CHUNK} draws only {CHUNK - int(missing.max())} scenes admit a "
-        f"suitable goal of {options.task!r} in split {options.split!r} within "
-        f"{options.max_steps} steps: give the layout more objects or boxes, or episodes more "
-        "steps"
-    )
+    key = derive(seed, "scenes", options.stream)
+    left = torch.arange(len(numbers), device=numbers.device)
+    width = max(len(left), FEWEST)
+    found: list[Any] = []
+    places: list[Tensor] = []
+    tried = drawn = 0
+    while not found or len(left):
+        if drawn >= PATIENCE * width:
+            raise UserError(
+                f"after {drawn} draws only {len(numbers) - len(left)} of {len(numbers)} scenes "
+                f"admit a suitable goal of {options.task!r} in split {options.split!r} within "
+                f"{options.max_steps} steps: give the layout more objects or boxes, or episodes "
+                "more steps"
+            )
+        times = width // len(left) if tried else 1
+        draws = torch.arange(tried, tried + times, device=left.device).repeat(len(left))
+        lots = Lots(key, numbers[left].repeat_interleave(times), draws)
+        proposal, good = _propose(options, lots)
+        has, first = good.view(len(left), times).max(1)
+        found.append(proposal[(torch.arange(len(left), device=left.device) * times + first)[has]])
+        places.append(left[has])
+        left, tried, drawn = left[~has], tried + times, drawn + len(lots)
+    every: Any = torch.cat(found)
+    return _said(every[torch.cat(places).argsort()], options)
 
 
-def _propose(options: SceneOptions, draws: list[torch.Generator]) -> tuple[_Proposal, Tensor]:
-    """Draw a chunk of scenes with each of G generators, and say which are suitable, [G, CHUNK]."""
-    n = CHUNK * len(draws)
-    state = random_layout(n, options.shown_layout, generator=draws)
-    goal = propose_goal(state, check_task(options.task), draws)
+def _propose(options: SceneOptions, lots: Lots) -> tuple[_Proposal, Tensor]:
+    """Draw scenes [N], and say which are suitable, bool [N]."""
+    state = random_layout(lots, options.shown_layout)
+    goal = propose_goal(state, check_task(options.task), lots)
     wanted = plan(state, goal, options.max_steps)
     good = (wanted.verdict == SUITABLE) & in_split(goal, options.split, options.holdout)
     if not options.instructed:
         good = torch.ones_like(good)
-    wording = _integers(len(grammar(options.task).phrasings), n, draws)
-    return _Proposal(state, wanted, goal, wording, batch_size=[n]), good.view(len(draws), CHUNK)
+    wording = lots.below(len(grammar(options.task).phrasings)).squeeze(-1)
+    return _Proposal(state, wanted, goal, wording, batch_size=[len(lots)]), good
 
 
 def _said(found: _Proposal, options: SceneOptions) -> Scene:
@@ -146,12 +158,8 @@ def _said(found: _Proposal, options: SceneOptions) -> Scene:
         said = grammar(options.task).encode(found.goal, found.wording)
     else:
         wanted = torch.zeros_like(wanted)
-        said = torch.zeros(len(found), VOCABULARY.length, dtype=torch.int64)
+        said = found.wording.new_zeros(len(found), VOCABULARY.length)
     return Scene(found.state, wanted, said, batch_size=found.batch_size)
-
-
-def _integers(high: int, n: int, source: Generators) -> Tensor:
-    return draw_rows(partial(torch.randint, high), (n,), source)
 
 
 def leaves(whole: WorldState | Plan | Scene) -> list[Tensor]:
@@ -163,37 +171,33 @@ def leaves(whole: WorldState | Plan | Scene) -> list[Tensor]:
     return found
 
 
-def propose_goal(state: WorldState, task: int, source: Generators) -> Goal:
+def propose_goal(state: WorldState, task: int, lots: Lots) -> Goal:
     """Draw a goal about things that are in states [N]; it need not be suitable."""
-    shape = state.arm.shape
-
-    def drawn() -> Tensor:
-        return draw_rows(torch.rand, state.objects.shape, source, dtype=torch.float32)
 
     def pick(mask: Tensor) -> Tensor:
-        """Draw one true cell of each row."""
-        return (drawn() * mask).argmax(-1, keepdim=True)
+        """Draw one true cell of each row, [N, 1]; the first cell where none is true."""
+        order = mask.cumsum(-1, dtype=torch.int16)
+        return (order > lots.below(order[:, -1:].long())).byte().argmax(-1, keepdim=True)
 
     def at(cells: Tensor, values: Tensor) -> Tensor:
         return values.gather(-1, cells).squeeze(-1).long()
 
-    nothing = torch.zeros(shape, dtype=torch.int64)
-    exists = state.objects > 0
-    candidates = exists & (state.boxes > 0) if task == PICK_OUT else exists
-    cell = pick(candidates)
-    reference = nothing
+    objects, boxes = state.objects > 0, state.boxes > 0
+    cell = pick(objects & boxes if task == PICK_OUT else objects)
+    reference = target = side = nothing = torch.zeros_like(state.arm)
     if task == PICK_UDLR:
         others = state.objects.scatter(-1, cell, 0)
         reference = at(pick(others > 0), others)
-    else:
-        drawn()  # as of every task, so that scenes stay what they are
-    has_box = state.boxes > 0
+    if task in (PICK, PICK_OUT):
+        target = at(pick(boxes), state.boxes)
+    if task in (MOVE_UDLR, PICK_UDLR):
+        side = lots.below(4).squeeze(-1)
     return Goal(
-        task=torch.full(shape, task),
+        task=torch.full_like(nothing, task),
         object=at(cell, state.objects),
         reference=reference,
         source=at(cell, state.boxes) if task == PICK_OUT else nothing,
-        target=at(pick(has_box), state.boxes) if task in (PICK, PICK_OUT) else nothing,
-        side=_integers(4, len(state.arm), source) if task in (MOVE_UDLR, PICK_UDLR) else nothing,
-        batch_size=shape,
+        target=target,
+        side=side,
+        batch_size=nothing.shape,
     )

@@ -11,11 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ifo_grounding.tasks.scenes import AHEAD, CHUNK, Scene, SceneOptions, draw_block, leaves
+from ifo_grounding.tasks.scenes import FEWEST, Scene, SceneOptions, draw_scenes
 
-BLOCK = AHEAD * CHUNK
-"""Scenes that are drawn at once."""
-BLOCKS_KEPT = 8
+BLOCKS_KEPT = 16
 """Blocks that a stream remembers."""
 
 
@@ -25,7 +23,7 @@ class SceneStream:
     Args:
         options: which scenes.
         seed: of what is drawn.
-        device: where scenes go; they are drawn on the CPU.
+        device: where scenes are drawn.
 
     >>> stream = SceneStream(SceneOptions("pick"), seed=0)
     >>> scenes = stream.scenes(torch.tensor([5, 2000]))
@@ -44,31 +42,15 @@ class SceneStream:
 
     def scenes(self, numbers: Tensor) -> Scene:
         """Return the scenes with the given numbers, int64 [N] from 0 on."""
-        every, places = self._holding(numbers)
-        return every[places]
-
-    def write(self, numbers: Tensor, into: list[Tensor], rows: Tensor) -> None:
-        """Write the scenes with the given numbers, int64 [N], to rows of others, int64 [N].
-
-        Args:
-            numbers: which scenes.
-            into: :func:`leaves` of the others.
-            rows: where, each once.
-        """
-        every, places = self._holding(numbers)
-        for leaf, source in zip(into, leaves(every), strict=True):
-            leaf.index_copy_(0, rows, source.index_select(0, places))
-
-    def _holding(self, numbers: Tensor) -> tuple[Scene, Tensor]:
-        """Return blocks of scenes, one after the other, and the places of some scenes there."""
-        blocks, which = (numbers // BLOCK).unique(return_inverse=True)
+        blocks, which = (numbers // FEWEST).unique(return_inverse=True)
         parts: list[Any] = [self._block(block) for block in blocks.tolist() or [0]]
         every: Any = parts[0] if len(parts) == 1 else torch.cat(parts)
-        return every, which * BLOCK + numbers % BLOCK
+        return every[which * FEWEST + numbers % FEWEST]
 
     def _block(self, block: int) -> Scene:
         if block not in self._blocks:
             if len(self._blocks) == BLOCKS_KEPT:
                 del self._blocks[next(iter(self._blocks))]
-            self._blocks[block] = draw_block(self.options, self.seed, block).to(self.device)
+            numbers = torch.arange(block * FEWEST, (block + 1) * FEWEST, device=self.device)
+            self._blocks[block] = draw_scenes(self.options, self.seed, numbers)
         return self._blocks[block]

@@ -9,8 +9,11 @@ import torch
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, whole
-from ifo_grounding.seeding import Generators, draw_rows
+from ifo_grounding.seeding import Lots
 from ifo_grounding.world.state import N_BOXES, N_KINDS, WorldState
+
+FINE = 1 << 30
+"""Parts into which a probability is divided."""
 
 
 @dataclass(frozen=True)
@@ -48,44 +51,33 @@ class Layout:
             raise UserError("excluded_kinds leaves no kind of object")
 
 
-def random_layout(
-    batch: int,
-    layout: Layout | None = None,
-    *,
-    generator: Generators = None,
-    device: torch.device | str | None = None,
-) -> WorldState:
+def random_layout(lots: Lots, layout: Layout | None = None) -> WorldState:
     """Draw initial states: objects and boxes in distinct places, the arm anywhere, nothing held.
 
-    >>> state = random_layout(3, generator=torch.Generator().manual_seed(0))
-    >>> state.held.tolist()
+    >>> random_layout(Lots(0, torch.arange(3))).held.tolist()
     [0, 0, 0]
     """
     layout = layout or Layout()
-    cells = layout.size**2
+    batch, device, cells = len(lots), lots.device, layout.size**2
     most_objects, most_boxes = layout.objects[1], layout.boxes[1]
 
-    def rand(width: int) -> Tensor:
-        return draw_rows(torch.rand, (batch, width), generator, device=device, dtype=torch.float32)
-
     def count(low: int, high: int) -> Tensor:
-        return low + (rand(1) * (high - low + 1)).long()
+        return low + lots.below(high - low + 1)
 
-    places = highest(rand(cells), most_boxes + most_objects)
+    places = lots.distinct(cells, most_boxes + most_objects)
 
-    colours = 1 + rand(N_BOXES).argsort(-1)[:, :most_boxes]
+    colours = 1 + lots.distinct(N_BOXES, most_boxes)
     n_boxes = count(*layout.boxes)
     box_exists = torch.arange(most_boxes, device=device) < n_boxes
     boxes = torch.zeros(batch, cells, dtype=torch.uint8, device=device)
     boxes.scatter_(-1, places[:, :most_boxes], (colours * box_exists).to(torch.uint8))
 
     allowed = [k for k in range(1, N_KINDS + 1) if k not in layout.excluded_kinds]
-    table = torch.tensor(allowed, device=device)
-    kinds = table[(rand(most_objects) * len(allowed)).long()]
+    kinds = torch.tensor(allowed, device=device)[lots.below(len(allowed), most_objects)]
     number = torch.arange(most_objects, device=device)
     kinds = kinds * (number < count(*layout.objects))
 
-    wants_box = (rand(most_objects) < layout.inside) & (kinds > 0)
+    wants_box = (lots.below(FINE, most_objects) < round(layout.inside * FINE)) & (kinds > 0)
     rank = wants_box.long().cumsum(-1) - 1
     in_box = wants_box & (rank < n_boxes)
     cell = places.gather(-1, torch.where(in_box, rank, most_boxes + number))
@@ -93,26 +85,6 @@ def random_layout(
     objects = torch.zeros(batch, cells, dtype=torch.uint8, device=device)
     objects.scatter_add_(-1, cell, kinds.to(torch.uint8))
 
-    arm = (rand(1).squeeze(-1) * cells).long()
+    arm = lots.below(cells).squeeze(-1)
     held = torch.zeros(batch, dtype=torch.uint8, device=device)
     return WorldState(arm=arm, held=held, objects=objects, boxes=boxes, batch_size=[batch])
-
-
-def highest(lots: Tensor, k: int) -> Tensor:
-    """Return ``lots.topk(k).indices``, int64 [N, k], on a CPU in a quarter of the time.
-
-    Lots are multiples of 2^-24 in [0, 1), as ``torch.rand`` draws them, float32 [N, C].
-    """
-    if lots.device.type != "cpu":
-        return lots.topk(k).indices
-    # Each place is written behind its lot, of 24 bits, for NumPy sorts whole numbers fastest.
-    bits = lots.shape[-1].bit_length()
-    ranked = (lots * 2 ** (24 + bits)).long().add_(torch.arange(lots.shape[-1]))
-    ranked.numpy().sort()
-    first = ranked[:, -k - 1 :].flip(-1)
-    places = first[:, :k] & (2**bits - 1)
-    drawn = first >> bits
-    alike = (drawn[:, 1:] == drawn[:, :-1]).any(-1).nonzero().squeeze(-1)
-    if len(alike):  # lots that are equal come in an order of torch's own
-        places[alike] = lots[alike].topk(k).indices
-    return places
