@@ -28,10 +28,11 @@ from ifo_grounding.data import (
     record_demonstrations,
 )
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.envs.simulator import AHEAD, Simulator
 from ifo_grounding.files import read_json
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.seeding import Lots
-from ifo_grounding.tasks import grammar
+from ifo_grounding.tasks import SceneOptions, grammar
 from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.transforms import InstructionSampler
 from ifo_grounding.world import (
@@ -168,6 +169,55 @@ def env_rollout() -> Row:
         {**ours(rollout), "without TensorDict": finished(simulate)},
         {"rate": 400e3},
         "a random policy, which ends every sixth episode at each step",
+    )
+
+
+def many_worlds(batch: int, drawn: bool) -> Row:
+    simulator = Simulator(SceneOptions("move"), batch, 0, device=DEVICE)
+    simulator.reset()
+    actions = torch.randint(
+        6, (8 * AHEAD, batch), device=DEVICE
+    )  # all that is drawn ahead, and more
+    action = actions[0].clone()
+
+    def advance() -> None:
+        _, terminated, truncated = simulator.step(action)
+        simulator.reset(terminated | truncated)
+        if drawn:
+            simulator.pixels()
+
+    def play(once: Callable[[], object]) -> float:
+        for some in actions:
+            action.copy_(some)
+            once()
+        return actions.numel()
+
+    contenders = ours(lambda: play(advance))
+    if DEVICE.startswith("cuda"):
+        stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
+        with torch.cuda.stream(stream):
+            advance()
+        simulator.seed(0)
+        simulator.draw_ahead()
+        torch.cuda.synchronize()
+        with torch.cuda.graph(graph):
+            advance()
+
+        def replay() -> None:
+            simulator.draw_ahead()
+            graph.replay()
+
+        contenders = {
+            **ours(lambda: play(replay)),
+            "kernel by kernel": finished(lambda: play(advance)),
+        }
+    return Row(
+        f"step, reset{' and pixels' if drawn else ''}, batch {batch:,}",
+        "steps/s",
+        contenders,
+        {"rate": 10e6 if drawn else 100e6},
+        "a random policy, which ends every sixth episode at each step; new scenes are drawn on the "
+        "way; on a GPU a step with its reset is one CUDA graph",
     )
 
 
@@ -473,6 +523,8 @@ ROWS: dict[str, Callable[[], Row]] = {
     "step": world_step,
     "pixels": world_pixels,
     "rollout": env_rollout,
+    "worlds": functools.partial(many_worlds, 65_536, False),
+    "worlds-pixels": functools.partial(many_worlds, 16_384, True),
     "gymnasium": gymnasium_vector,
     "collector-strong": functools.partial(collector, "strong", 1024, 20),
     "collector-strong-2048": functools.partial(collector, "strong", 2048, 10),

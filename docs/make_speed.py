@@ -10,9 +10,9 @@ from ifo_grounding.report import markdown_table
 
 OURS = "ifo-grounding"
 ORDER = (
-    *("step", "pixels", "rollout", "gymnasium", "collector-strong", "collector-paper", "sampler"),
-    *("imitation-strong", "imitation-paper", "labelling", "transitions", "recording", "memory"),
-    *("whole", "growth"),
+    *("step", "pixels", "worlds", "worlds-pixels", "rollout", "gymnasium", "collector-strong"),
+    *("collector-paper", "sampler", "imitation-strong", "imitation-paper", "labelling"),
+    *("transitions", "recording", "memory", "whole", "growth"),
 )
 """Of the rows in the tables; others come last."""
 

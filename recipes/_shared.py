@@ -35,6 +35,8 @@ REFERENCE = "reference-true-actions.safetensors"
 CLASSIFIER = "instruction.safetensors"
 REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
+CHECKSUMS = "networks.json"
+"""Of the networks that the run has trained, by file."""
 OF_PHASE_2 = ("self_examine", "continue_imitation", "evaluate", POLICIES["phase2"], CONTINUED)
 """Stages and networks that a run makes anew where it takes over another's phase 1."""
 CHOSEN_ANEW = (
@@ -109,7 +111,10 @@ def simulator_of(options: Options, num_envs: int = 1) -> Any:
 def build(make: Any, options: Options, **kwargs: Any) -> Any:
     """Build a network for the simulator's images, words and actions."""
     chosen = {"seed": options.seed, "device": options.device, **options.networks.changed()}
-    return make(simulator_of(options), options.preset, **{**chosen, **kwargs})
+    network = make(simulator_of(options), options.preset, **{**chosen, **kwargs})
+    if network.network_config.shapes.fit(words := world_of(options).vocabulary):
+        network.vocabulary = words
+    return network
 
 
 def learn(
@@ -125,7 +130,7 @@ def learn(
     decode_on(options.device, buffer)
     how = {"checkpoint": stage.checkpoint, "log": stage.log(), **fit_options(options, stage)}
     history = fit(loss, buffer, config, **how, **kwargs)
-    networks.save(loss.network, stage.run / file)
+    save_network(stage.run, file, loss.network)
     return finish(options, stage, history[-1], history)
 
 
@@ -136,7 +141,7 @@ def keep(
     history = best.finish(stage.log())
     if calibrate:
         best.loss.calibrate()
-    networks.save(best.loss.network, stage.run / file)
+    save_network(stage.run, file, best.loss.network)
     return finish(options, stage, {**history[-1], "trial": best.number}, history)
 
 
@@ -171,9 +176,20 @@ def shows_progress(options: Options) -> bool:
     return options.progress and sys.stderr.isatty()
 
 
+def checksums(run: Run) -> dict[str, str]:
+    """Return the checksums of the networks that a run has trained."""
+    return read_json(run / CHECKSUMS) if (run / CHECKSUMS).exists() else {}
+
+
+def save_network(run: Run, name: str, network: Any) -> None:
+    """Save a network that a recipe has trained, and note its checksum."""
+    write_json(run / CHECKSUMS, {**checksums(run), name: networks.save(network, run / name)})
+
+
 def load_network(run: Run, name: str, recipe: str, options: Options) -> TensorDictModuleBase:
-    """Load a network that an earlier recipe trained."""
-    return networks.load(run.need(name, recipe), device=options.device)
+    """Load a network that an earlier recipe trained; another run's is refused."""
+    path, checksum = run.need(name, recipe), checksums(run).get(name)
+    return networks.load(path, device=options.device, checksum=checksum)
 
 
 def starting_policy(run: Run, options: Options, warm_start: bool) -> Any:

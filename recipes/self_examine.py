@@ -15,6 +15,7 @@ from _shared import (
     load_labels,
     load_network,
     open_stage,
+    save_network,
     shows_progress,
     simulator_of,
     tell,
@@ -25,7 +26,6 @@ from imitate import labelled_demonstrations
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from ifo_grounding import networks
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
 from ifo_grounding.data import labelled_buffer
@@ -72,7 +72,7 @@ def examine(options: Options) -> dict:
         callback=audit_callback(policy, reward, run, options),
         progress=shows_progress(options),
     )
-    networks.save(policy, run / POLICIES["phase2"])
+    save_network(run, POLICIES["phase2"], policy)
     return finish(options, stage, history[-1], history)
 
 

@@ -108,7 +108,7 @@ class _Mode(TorchFunctionMode):
         for place, value in [*enumerate(others), *kwargs.items()]:
             if isinstance(value, torch.Tensor):
                 there, value = _on_gpu(value), _taken(value)
-            elif isinstance(value, (str, torch.device)):
+            elif isinstance(value, (str, torch.device)) and torch.device(value).type != "meta":
                 there, value = _is_gpu(value), "cpu"
             (others if isinstance(place, int) else kwargs)[place] = value
         with torch._C.DisableTorchFunctionSubclass():

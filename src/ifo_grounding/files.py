@@ -33,6 +33,14 @@ def regular_file(path: Path) -> Path:
     return path
 
 
+def unwritable(path: Path, reason: str) -> UserError:
+    """Return what to say where a file cannot be written, such as on a full disk."""
+    free = f"{shutil.disk_usage(path.parent).free / 1e6:,.0f} MB are free there"
+    return UserError(
+        f"{path} cannot be written ({reason}; {free}): make room, and run the same again to go on"
+    )
+
+
 @contextlib.contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that takes its name when the block ends well.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Iterator
 
 import torch
@@ -13,6 +14,23 @@ from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import ACTION_SCORE, GOAL_SCORE, SUITABILITY
+
+_MODES = threading.RLock()  # while it is held, a module may be in another mode than its own
+
+
+@contextlib.contextmanager
+def in_mode(training: bool, *modules: object) -> Iterator[None]:
+    """Run a block with modules in train or eval mode; every submodule gets its own mode back."""
+    parts = [part for m in modules if isinstance(m, nn.Module) for part in m.modules()]
+    with _MODES:
+        before = [part.training for part in parts]
+        try:
+            for part in parts:
+                part.training = training
+            yield
+        finally:
+            for part, was in zip(parts, before, strict=True):
+                part.training = was
 
 
 @contextlib.contextmanager
@@ -28,16 +46,8 @@ def evaluating(*modules: object) -> Iterator[None]:
     >>> [part.training for part in network]
     [True, False]
     """
-    parts = [part for m in modules if isinstance(m, nn.Module) for part in m.modules()]
-    in_training = [part for part in parts if part.training]
-    try:
-        for part in in_training:
-            part.training = False
-        with torch.no_grad():
-            yield
-    finally:
-        for part in in_training:
-            part.training = True
+    with in_mode(False, *modules), torch.no_grad():
+        yield
 
 
 def device_of(module: object) -> torch.device | None:

@@ -135,7 +135,7 @@ def test_inputs_of_different_batches_are_refused(shapes):
         ("strong", {"hidden": 1.5}, "hidden must be a whole number, got 1.5"),
         ("strong", {"dropout": 1.0}, "dropout must be below 1, got 1.0"),
         ("strong", {"precision": "fp8"}, "unknown precision 'fp8'"),
-        ("strong", {"head_hidden": (8, 0)}, r"head_hidden must be at least 1, got \(8, 0\)"),
+        ("strong", {"head_hidden": (8, 0)}, r"head_hidden must be 1..65536, got \(8, 0\)"),
         ("strong", {"sentence_rate": 0.5}, "an option of preset 'paper' alone.*leave it out"),
         ("paper", {"heads": 4}, "an option of preset 'strong' alone.*leave it out"),
         ("paper", {"sentence_pooling": "max"}, "unknown sentence_pooling 'max'"),

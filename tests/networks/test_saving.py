@@ -1,15 +1,20 @@
 import json
+import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from safetensors.torch import save as serialize
 from tensordict import TensorDict
 from torch import nn
 
+from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import write_json
 from ifo_grounding.networks import (
@@ -41,6 +46,16 @@ def mine(tmp_path):
     return save_pretrained(make_policy(SHAPES), tmp_path / "mine", vocabulary=VOCABULARY)
 
 
+@pytest.fixture
+def old(path):
+    """Return the folder of a policy without a checksum, whose words lie beside it."""
+    with safe_open(path, "pt") as file:
+        texts = {name: file.metadata()[name] for name in ("format", "network")}
+    save_file(load_file(path), path.with_name("network.safetensors"), texts)
+    write_json(path.with_name("vocabulary.json"), asdict(VOCABULARY))
+    return path.parent
+
+
 def test_what_is_loaded_is_what_was_saved(kind, preset, tmp_path):
     keys = nested_keys(MAKERS[kind](SHAPES))
     if kind == "policy":
@@ -69,6 +84,14 @@ def test_other_modules_cannot_be_saved(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_full_disk_is_one_line_and_keeps_the_network_before(path, monkeypatch):
+    before, full = path.read_bytes(), Mock(side_effect=SafetensorError("No space left on device"))
+    monkeypatch.setattr("ifo_grounding.networks.saving.save_file", full)
+    with pytest.raises(UserError, match=r"a\.safetensors cannot be written .* make room"):
+        save(make_policy(SHAPES), path)
+    assert path.read_bytes() == before
+
+
 def test_a_device_that_is_not_there_is_no_fault_of_the_file(path):
     for device in ("cdua", "xpu"):
         with pytest.raises(UserError, match=f"device={device} is none: use cpu"):
@@ -76,10 +99,12 @@ def test_a_device_that_is_not_there_is_no_fault_of_the_file(path):
 
 
 def test_missing_damaged_and_foreign_files_are_refused(path):
-    whole = path.read_bytes()
-    for cut in (0, 5, 500, -1):
-        path.write_bytes(whole[:cut])
-        with pytest.raises(UserError, match=r"a\.safetensors is damaged or no safetensors"):
+    contents = [path.read_bytes()[:cut] for cut in (0, 5, 500, -1)]
+    for network in ("[1]", "3", "[" * 100_000, "9" * 5_000):
+        contents.append(serialize({"a": torch.zeros(1)}, {"format": FORMAT, "network": network}))
+    for content in contents:
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=r"a\.safetensors is damaged, another"):
             load(path)
     save_file({"a": torch.zeros(1)}, path, {"format": "ifo-grounding network 1"})
     with pytest.raises(
@@ -89,9 +114,39 @@ def test_missing_damaged_and_foreign_files_are_refused(path):
     path.unlink()
     with pytest.raises(UserError, match=r"a\.safetensors does not exist"):
         load(path)
+    os.mkfifo(path)
+    with pytest.raises(UserError, match="no regular file"):
+        load(path)
+
+
+def test_a_weight_or_a_word_that_changed_is_refused(mine):
+    path = mine / "network.safetensors"
+    whole = path.read_bytes()
+    for damaged in (whole[:-1] + bytes([whole[-1] ^ 1]), whole.replace(b"circle", b"cirdle")):
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match="by its checksum, it is not what was saved"):
+            from_pretrained(mine)
+
+
+def test_another_network_and_one_without_numbers_are_refused(path):
+    policy = make_policy(SHAPES, seed=1)
+    checksum = save(policy, path)
+    assert save(load(path, checksum=checksum), path) == checksum
+    save(make_policy(SHAPES, seed=2), path)
+    with pytest.raises(UserError, match=r"another network .* delete it and train again"):
+        load(path, checksum=checksum)
+    next(policy.parameters()).data.fill_(torch.nan)
+    save(policy, path)
+    with pytest.raises(UserError, match="weights are not finite"):
+        load(path)
 
 
 CHANGES = {
+    "a vocabulary of millions": lambda content, _: content["shapes"].update(vocabulary_size=10**7),
+    "a number too large": lambda content, _: content["shapes"].update(vocabulary_size=10**30),
+    "a large image": lambda content, _: content["shapes"].update(image_shape=[3, 10**5, 10**5]),
+    "features": lambda content, _: content["config"].update(features=10**9),
+    "layers without end": lambda content, _: content["config"].update(context=10**9),
     "another kind": lambda content, weights: content.update(kind="oracle"),
     "another size": lambda content, weights: content["config"].update(features=32),
     "a preset that is gone": lambda content, weights: content["config"].update(preset="film"),
@@ -103,18 +158,26 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_mismatching_files_are_refused(path, change):
+def test_mismatching_files_are_refused_before_they_take_memory(path, change, monkeypatch):
+    def make(*args, device, **options):
+        assert device == "meta"
+        return make_policy(*args, device=device, **options)
+
     with safe_open(path, "pt") as file:
-        weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        content = json.loads(file.metadata()["network"])
+        weights, content = load_file(path), json.loads(file.metadata()["network"])
     change(content, weights)
     save_file(weights, path, {"format": FORMAT, "network": json.dumps(content)})
+    monkeypatch.setitem(MAKERS, "policy", make)
     with pytest.raises(UserError, match=r"a\.safetensors does not fit"):
         load(path)
 
 
-def test_words_are_kept_when_a_network_is_saved_again(mine, tmp_path):
-    assert from_pretrained(mine).vocabulary == VOCABULARY
+def test_words_are_kept_when_a_network_is_saved_again(mine, old, tmp_path):
+    save(make_policy(PickAndPlaceEnv("move")), tmp_path / "a.safetensors")
+    assert load(tmp_path / "a.safetensors").vocabulary == VOCABULARY
+    assert from_pretrained(mine).vocabulary == from_pretrained(old).vocabulary == VOCABULARY
+    save_pretrained(from_pretrained(old), old)
+    assert from_pretrained(old).vocabulary == VOCABULARY and not (old / "vocabulary.json").exists()
     save_pretrained(from_pretrained(mine), tmp_path / "again")
     assert from_pretrained(tmp_path / "again").vocabulary == VOCABULARY
     fewer = Vocabulary(VOCABULARY.words[:5])
@@ -129,20 +192,34 @@ def test_words_are_kept_when_a_network_is_saved_again(mine, tmp_path):
         (Vocabulary(VOCABULARY.words, length=9), "and 9 per instruction, .* for 48 and 16"),
     ],
 )
-def test_words_that_do_not_fit_are_refused(mine, words, said):
+def test_words_that_do_not_fit_are_refused(mine, old, words, said):
     with pytest.raises(UserError, match=f"the vocabulary .*{said}"):
         save_pretrained(make_policy(SHAPES), mine / "other", vocabulary=words)
     assert not (mine / "other").exists()
-    write_json(mine / "vocabulary.json", {"words": words.words, "length": words.length})
+    write_json(old / "vocabulary.json", asdict(words))
     with pytest.raises(UserError, match=rf"vocabulary\.json .*{said}"):
-        from_pretrained(mine)
+        from_pretrained(old)
 
 
-def test_damaged_words_are_refused(mine):
+def test_damaged_words_are_refused(old):
     for content in ([1], {}, None, {"words": [1], "length": 16}, {"words": 3}):
-        write_json(mine / "vocabulary.json", content)
-        with pytest.raises(UserError, match=r"vocabulary\.json holds no words"):
-            from_pretrained(mine)
+        write_json(old / "vocabulary.json", content)
+        with pytest.raises(UserError, match=r"vocabulary\.json .*holds"):
+            from_pretrained(old)
+
+
+def test_links_are_replaced_and_pipes_not_waited_for(tmp_path):
+    folder, names = tmp_path / "mine", ("network.safetensors", "vocabulary.json", "README.md")
+    folder.mkdir()
+    for name in names:
+        (tmp_path / name).write_text("library_name: ifo-grounding")
+        (folder / name).symlink_to(tmp_path / name)
+    save_pretrained(make_policy(SHAPES), folder)
+    assert {(tmp_path / name).read_text() for name in names} == {"library_name: ifo-grounding"}
+    (folder / "README.md").unlink()
+    for name in names[1:]:
+        os.mkfifo(folder / name)
+    assert from_pretrained(save_pretrained(make_policy(SHAPES), folder)).vocabulary is None
 
 
 def test_other_files_of_a_folder_stay(tmp_path, monkeypatch):
@@ -153,13 +230,14 @@ def test_other_files_of_a_folder_stay(tmp_path, monkeypatch):
         Path(name).write_text(text)
     assert save_pretrained(make_policy(SHAPES), ".", vocabulary=VOCABULARY) == Path()
     assert {name: Path(name).read_text() for name in kept} == kept
-    written = {"network.safetensors", "vocabulary.json"}
-    assert {path.name for path in Path().iterdir()} == written | {"thesis.tex", ".git", "README.md"}
+    there = {"network.safetensors", "thesis.tex", ".git", "README.md"}
+    assert {path.name for path in Path().iterdir()} == there
 
 
 def test_a_network_takes_the_place_of_another(mine):
     facts = {"Task": "move", "phase 2 success": "99.7% [99.5, 99.8]", "Command": "`make demo`"}
-    save_pretrained(make_inverse(SHAPES), mine, facts=facts)
+    odd = {"Level|\nof mine": "a|b\nc \ud800"}
+    save_pretrained(make_inverse(SHAPES), mine, facts={**facts, **odd})
     assert sorted(path.name for path in mine.iterdir()) == ["README.md", "network.safetensors"]
     assert from_pretrained(mine).vocabulary is None
     with pytest.raises(UserError, match="'inverse', not 'policy'"):
@@ -168,6 +246,7 @@ def test_a_network_takes_the_place_of_another(mine):
     assert card.startswith("---\nlibrary_name: ifo-grounding\n")
     for shown in ("names the action", "| Preset | strong |", "3x16x16", *facts.values()):
         assert shown in card
+    assert r"| Level\| of mine | a\|b c ? |" in card
 
 
 def test_what_cannot_be_shared_or_found_is_said(mine, tmp_path, monkeypatch):

@@ -1,6 +1,8 @@
 """What every loss must do, whatever it is for."""
 
 import re
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -8,6 +10,7 @@ from tensordict import TensorDict
 from torchrl.objectives import LossModule
 
 from ifo_grounding.errors import UserError
+from ifo_grounding.modules import evaluating
 from objectives.conftest import POOL, batch, make_loss, seeded, total
 
 
@@ -31,6 +34,8 @@ def test_it_reads_what_it_says_and_leaves_its_input_alone(kind):
     for key in loss.in_keys:
         with pytest.raises(UserError, match=f"lacks .{re.escape(repr(key))}"):
             loss(data.exclude(key))
+    with pytest.raises(UserError, match="the batch is empty"):
+        loss(data[:0])
 
 
 def test_it_can_be_called_without_a_tensordict(kind):
@@ -85,6 +90,20 @@ def test_the_network_computes_in_the_mode_of_the_loss_and_keeps_its_own(
     with pytest.raises((UserError, RuntimeError)):
         loss(batch().set("pixels", torch.zeros(12, 3, 8, 8)))
     assert {part.training for part in loss.network.modules()} == {network_training}
+
+
+def test_threads_do_not_take_one_anothers_mode_for_a_networks_own():
+    loss = make_loss("inverse")
+
+    def compute(mode):
+        with mode():
+            time.sleep(0.02)
+            return loss.network.training
+
+    with ThreadPoolExecutor(3) as pool:
+        modes = [loss._mode, loss._mode, lambda: evaluating(loss.network)]
+        assert [*pool.map(compute, modes)] == [True, True, False]
+    assert not loss.network.training
 
 
 def test_keys_of_networks_and_losses_can_be_nested(kind):

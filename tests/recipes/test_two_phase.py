@@ -56,6 +56,7 @@ def test_both_phases_of_strong_run_through_and_write_a_report(options, tmp_path)
     trained = networks.load(run / "policy-phase2.safetensors")
     assert all(map(torch.equal, policy.state_dict().values(), trained.state_dict().values()))
     assert policy.vocabulary.decode(torch.tensor([[1]])) == ["circle"]
+    assert trained.vocabulary == policy.vocabulary
     assert "| Task | move-udlr |" in (shared / "policy" / "README.md").read_text()
 
     # A second call finds everything done.
@@ -116,6 +117,15 @@ def test_options_replace_values_of_every_network(options, phase_1):
     assert inverse.network_config.config.features == 16
     with pytest.raises(UserError, match="sentence_rate"):
         make_stages(options("networks.sentence_rate=0.5", run="second"), until="train_inverse")
+
+
+def test_the_network_of_another_run_is_refused(options, phase_1):
+    from _shared import load_network, open_run
+
+    other = networks.make_inverse(networks.Shapes((3, 8, 8), 9))
+    networks.save(other, phase_1 / "inverse.safetensors")
+    with pytest.raises(UserError, match="not what was saved"):
+        load_network(open_run(options()), "inverse.safetensors", "train_inverse", options())
 
 
 def test_a_stage_without_what_it_needs_says_what_to_run(options):

@@ -115,7 +115,7 @@ def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
     assert results["phase2"]["rate"]["count"] == 20
     assert "goal_return" in results and "suitability" not in results and "labels" not in results
     policy = networks.load(tmp_path / "run" / "policy-phase2.safetensors")
-    assert policy.network_config.shapes.n_actions == 3
+    assert policy.network_config.shapes.n_actions == 3 and "dial" in policy.vocabulary.words
     assert world[0] == "world=gymnasium" or "dial" in report(given).read_text()
 
 
@@ -175,7 +175,7 @@ def test_both_phases_run_in_babyai(options, tmp_path):
     demos = Demonstrations.load(tmp_path / "run" / "demonstrations")
     policy = networks.load(tmp_path / "run" / "policy-phase2.safetensors")
     assert demos.vocabulary.decode(demos.pool()[:1])[0].startswith("go to")
-    assert policy.network_config.shapes.vocabulary_size == len(demos.vocabulary)
+    assert policy.vocabulary == demos.vocabulary
     [path] = (tmp_path / "results").glob("*.json")
     assert path.name == "GoToObj-60-strong-seed0.json"
     # True actions reached the reference alone: phase 1 does without the truth.

@@ -65,9 +65,9 @@ def page(tmp_path):
         "Curve!": figure,
         "Cases": [Captioned(picture, "move <here>", note="missing")],
         "No cases": [],
-        "Clip": gif,
+        "Clip" * 99: gif,
     }
-    return write_report(tmp_path / "report", results, pictures, title="A & B", summary="<i>")
+    return write_report(tmp_path / "report", results, pictures, title="A & B \ud800", summary="<i>")
 
 
 def test_it_is_one_page_without_any_outside_source(page):
@@ -82,9 +82,9 @@ def test_it_is_one_page_without_any_outside_source(page):
 def test_every_content_is_there_and_escaped(page):
     outline = read(page)
     tables, shown = ["By task", "Settings", "Remark"], ["Curve", "Curve!", "Cases", "No cases"]
-    assert outline.headings == [*tables, *shown, "Clip"]
+    assert outline.headings == [*tables, *shown, "Clip" * 99]
     texts = outline.texts
-    for text in ("A & B", "95.0%", "[94.0, 95.9] (n=2000)", "+50.0 points", "5 < 6 & so on"):
+    for text in ("A & B ?", "95.0%", "[94.0, 95.9] (n=2000)", "+50.0 points", "5 < 6 & so on"):
         assert text in texts, text
     for text in ("<b>", "<i>", "move <here>", "missing", "None.", "0.0008", "–"):
         assert text in texts, text
@@ -97,7 +97,7 @@ def test_files_beside_the_page(page):
     assert results["By task"][0]["success"]["count"] == 10
     assert results["Settings"] == {"seed": 0, "rate": 8e-4, "path": [1, 2], "nan": None}
     names = sorted(path.name for path in (folder / "pictures").iterdir())
-    assert names == ["01-curve.png", "02-curve.png", "03-cases.png", "05-clip.gif"]
+    assert names == ["01-curve.png", "02-curve.png", "03-cases.png", f"05-{('clip' * 20)[:77]}.gif"]
 
 
 def test_refusals(tmp_path):

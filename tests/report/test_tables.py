@@ -26,10 +26,10 @@ def test_text_table():
 
 
 def test_markdown_table():
-    rows = [{name: row[name] for name in ("task", "success")} for row in ROWS]
+    rows = [{"task|\nlevel": row["task"], "success": row["success"]} for row in ROWS]
     assert markdown_table(rows) == "\n".join(
         [
-            "| task | success |",
+            r"| task\| level | success |",
             "| --- | ---: |",
             "| move | 97.3% [96.5,\u00a097.9] (n=2000) |",
             r"| pick\|out | – |",

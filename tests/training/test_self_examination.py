@@ -4,6 +4,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, GymEnv, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 from ifo_grounding import keys
@@ -201,6 +202,13 @@ def test_envs_that_leak_or_lack_something_are_refused(make, error):
 def test_impossible_configs_are_refused(wrong):
     with pytest.raises(UserError):
         SelfExaminationConfig(**wrong)
+
+
+def test_policies_that_are_no_actors_are_refused():
+    policy, value = make_networks()
+    for wrong in (TensorDictSequential(policy), policy[0]):
+        with pytest.raises(UserError, match=r"must be an actor.*Sequential\(\*others, \*actor\)"):
+            self_examine(make_env(), wrong, value, config(), seed=0)
 
 
 def test_the_summary_counts_by_hand():

@@ -150,6 +150,9 @@ def test_only_losses_are_minimised():
     losses = TensorDict({"loss_a": torch.tensor(2.0), "loss_b": torch.tensor([1.0, 3.0])}, [])
     losses["accuracy"] = torch.tensor(100.0)
     assert total_loss(losses) == 4.0
+    for none in (torch.ones(()), None, losses.select("accuracy")):
+        with pytest.raises(UserError, match=r"entries named loss_\*, got (T|NoneT).* without"):
+            total_loss(none)
 
 
 def test_what_cannot_be_sampled_is_refused():

@@ -22,7 +22,7 @@ RENDER_TILE_SIZE = 32
 """Pixels along one side of a cell in pictures for people."""
 AHEAD = 16
 """Resets of all rows for which scenes are drawn ahead; then a GPU is asked how many have begun."""
-CHUNK = 1 << 17
+CHUNK = 1 << 18
 """Most scenes that are drawn at once, for memory's sake."""
 
 
@@ -134,7 +134,10 @@ class Simulator:
         if mask is None or not self.started:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         if numbers is None:
-            numbers, drawn = self._following(mask)
+            self.draw_ahead()
+            order = mask.cumsum(0)
+            numbers, drawn = self._next + order - 1, self._ahead
+            self._next += order[-1]
             places = numbers % len(drawn[0])
         else:
             drawn = leaves(self.stream.scenes(numbers.where(mask, 0)))
@@ -154,30 +157,27 @@ class Simulator:
             new = source.index_select(0, places)
             torch.where(mask.view(-1, *[1] * (leaf.ndim - 1)), new, leaf, out=leaf)
 
-    def _following(self, mask: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Number the stream's next scenes for the rows of a mask, int64 [num_envs], and draw them.
+    @torch.inference_mode(False)
+    def draw_ahead(self) -> None:
+        """Make sure that scenes are drawn for one more reset of all rows.
 
-        Returns:
-            The numbers, and the leaves of scenes drawn ahead, each at its number modulo their
-            count.
+        Each reset does so; call it before each replay of a CUDA graph that resets. A scene drawn
+        ahead lies at its number modulo their count.
         """
         on_cpu = self.device.type == "cpu"
         count = max(FEWEST, self.num_envs * (2 if on_cpu else AHEAD))
+        if on_cpu or self._most + self.num_envs > self._drawn:
+            self._most = int(self._next)
         if self._most + self.num_envs > self._drawn:
-            first = self._most = int(self._next)
-            new = torch.arange(max(first, self._drawn), first + count, device=self.device)
-            for part in new.split(CHUNK):
+            end = self._most + count
+            for part in torch.arange(self._drawn, end, device=self.device).split(CHUNK):
                 drawn = leaves(draw_scenes(self.stream.options, self.stream.seed, part))
                 if not self._ahead:
                     self._ahead = [leaf.new_empty(count, *leaf.shape[1:]) for leaf in drawn]
                 for leaf, rows in zip(self._ahead, drawn, strict=True):
                     leaf.index_copy_(0, part % count, rows)
-            self._drawn = first + count
-        order = mask.cumsum(0)
-        numbers = self._next + order - 1
-        self._next += order[-1]
-        self._most += int(order[-1]) if on_cpu else self.num_envs
-        return numbers, self._ahead
+            self._drawn = end
+        self._most += self.num_envs
 
     @torch.inference_mode(False)
     def ask(self, rows: Tensor, tokens: Tensor) -> None:

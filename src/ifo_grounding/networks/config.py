@@ -21,6 +21,8 @@ ONLY_IN = {
     **dict.fromkeys(("patch_size", "context", "heads", "values", "maps"), "strong"),
 }
 """Options of one preset alone."""
+MOST_FEATURES, MOST_LAYERS = 1 << 16, 100
+"""Bounds of sizes and depths, far above what learns."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +78,15 @@ class NetworkConfig:
         check_choice("precision", self.precision, (None, "fp32", "bf16"))
         check_numbers(self)
         sizes = ("features", "hidden", "conv_layers", "embedding", "patch_size", "maps")
-        check_range(self, *sizes, least=1)
-        check_range(self, "context", "heads", "values", "dropout", least=0)
+        check_range(self, *sizes, least=1, most=MOST_FEATURES)
+        check_range(self, "context", "heads", "values", "dropout", least=0, most=MOST_FEATURES)
+        check_range(self, "conv_layers", "context", most=MOST_LAYERS)
         check_range(self, "sentence_rate", above=0, most=1)
         if self.dropout >= 1:
             raise UserError(f"dropout must be below 1, got {self.dropout}")
         object.__setattr__(self, "head_hidden", tuple(self.head_hidden))
-        if any(size < 1 for size in self.head_hidden):
-            raise UserError(f"sizes in head_hidden must be at least 1, got {self.head_hidden}")
+        if any(not 1 <= size <= MOST_FEATURES for size in self.head_hidden):
+            raise UserError(f"head_hidden must be 1..{MOST_FEATURES}, got {self.head_hidden}")
         for field in fields(self):
             only = ONLY_IN.get(field.name, self.preset)
             if only != self.preset and getattr(self, field.name) != field.default:

@@ -16,6 +16,7 @@ from torchrl.data import Categorical as CategoricalSpec
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from ifo_grounding import keys, seeding
+from ifo_grounding.attributes import attribute
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import INPUTS, NetworkConfig
 from ifo_grounding.networks.inverse import InverseNetwork
@@ -84,6 +85,8 @@ def build(
     built = built.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     module = wrap(built, options["in_keys"], [options.get("out_key")])
     module.network_config = Blueprint(kind, shapes, config, options)
+    words = attribute(source, "vocabulary")
+    module.vocabulary = words if shapes.fit(words) else None
     return module.eval()
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,10 @@ from safetensors.torch import save_file
 from torch import nn
 
 from ifo_grounding.errors import UserError, optional
-from ifo_grounding.files import atomic_write, read_json, write_json
+from ifo_grounding.files import atomic_write, read_json, regular_file, unwritable
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks import makers
+from ifo_grounding.networks.card import LIBRARY, card
 from ifo_grounding.networks.makers import Blueprint
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.tasks.vocabulary import Vocabulary
@@ -32,75 +35,77 @@ MAKERS: dict[str, Callable[..., Any]] = {
 }
 WEIGHTS = "network.safetensors"
 WORDS = "vocabulary.json"
+"""Words of a folder whose network does not hold them itself."""
 CARD = "README.md"
 FILES = [WEIGHTS, WORDS, CARD]
-LIBRARY = "library_name: ifo-grounding"
-ROLES = {
-    "policy": "chooses an action for an image and an instruction",
-    "value": "estimates the learned return of an image and an instruction",
-    "inverse": "names the action that led from one image to the next",
-    "instruction": "says whether an instruction suits an image",
-    "reward": "says whether an action is right for an image and an instruction",
-    "goal": "says whether an instruction is fulfilled, by the first and the present image",
-}
+MOST_BUFFERS = 1 << 28  # bytes that depend on the size of images, and on no weight
 
 
-def save(module: nn.Module, path: str | Path) -> None:
-    """Write a network built by a ``make_*`` function to ``path``, atomically.
+def save(module: nn.Module, path: str | Path) -> str:
+    """Write a network built by a ``make_*`` function to ``path``, atomically, with its words.
 
+    Its words are its attribute ``vocabulary``, which ``make_*`` reads from what it is built for.
     What was copied from ``init_from`` is not kept: training on after loading lets weights decay to
     zero, not to what they were there.
 
+    Returns a checksum, by which :func:`load` tells this network from others.
+
     Raises:
-        UserError: for a module that no ``make_*`` function built.
+        UserError: for any other module, for words that do not fit it, or where the disk is full.
 
     >>> import tempfile
     >>> policy = makers.make_policy(Shapes(image_shape=(3, 16, 16), vocabulary_size=9), seed=0)
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     save(policy, f"{folder}/policy.safetensors")
-    ...     again = load(f"{folder}/policy.safetensors")
+    ...     checksum = save(policy, f"{folder}/policy.safetensors")
+    ...     again = load(f"{folder}/policy.safetensors", checksum=checksum)
     >>> all(map(torch.equal, policy.state_dict().values(), again.state_dict().values()))
     True
     """
-    plan = json.dumps(asdict(_blueprint(module)), sort_keys=True)
-    weights = {
-        name: value.detach().cpu().contiguous() for name, value in module.state_dict().items()
-    }
-    with atomic_write(path) as temporary:
-        save_file(weights, temporary, {"format": FORMAT, "network": plan})
+    return _write(module, Path(path), getattr(module, "vocabulary", None))
 
 
 def load(
-    path: str | Path, device: torch.device | str | None = None, kind: str | None = None
+    path: str | Path,
+    device: torch.device | str | None = None,
+    kind: str | None = None,
+    checksum: str | None = None,
 ) -> Any:
-    """Read a network that :func:`save` wrote and build it again on ``device``.
+    """Read a network that :func:`save` wrote and build it again, with its words, on ``device``.
 
     Args:
         path: the file.
         device: where to build it.
         kind: the kind that is expected (``"policy"``, ``"inverse"``, ...); None allows any.
+        checksum: what :func:`save` returned for it; None allows any.
 
     Raises:
         UserError: where the file is missing, damaged, of another origin or another kind.
     """
     check_device(device or "cpu")
-    plan, weights = _read(Path(path))
+    plan, weights = _read(Path(path), checksum)
     found = str(plan.get("kind"))
     if kind not in (None, found):
         raise UserError(f"{path} holds a network of kind {found!r}, not {kind!r}")
     try:
         options = {name: _key(value) for name, value in plan["options"].items()}
         options["in_keys"] = [_key(value) for value in plan["options"]["in_keys"]]
-        shapes = Shapes(**plan["shapes"])
-        module = MAKERS[found](shapes, device=device, seed=0, **options, **plan["config"])
+        make = partial(MAKERS[found], Shapes(**plan["shapes"]), **options, **plan["config"])
+        with torch.device("meta"):  # takes no memory for sizes that a file only claims
+            claimed = make(device="meta")
+        claimed.load_state_dict(weights, assign=True)
+        if sum(buffer.nbytes for buffer in claimed.buffers()) > MOST_BUFFERS:
+            raise ValueError(f"images of {plan['shapes']['image_shape']} are too large")
+        module = make(device=device, seed=0)
         module.load_state_dict(weights)
     except torch.OutOfMemoryError:
         raise  # says nothing against the file
-    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+    except (LookupError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         raise UserError(
             f"{path} does not fit this version of ifo-grounding ({_first_line(error)}): train the "
             "network again"
         ) from None
+    if (words := plan.get("vocabulary")) is not None:
+        module.vocabulary = _vocabulary(words, module.network_config.shapes, path)
     return module
 
 
@@ -117,9 +122,9 @@ def save_pretrained(
 
     Args:
         module: what a ``make_*`` function built.
-        folder: where to. In a folder that exists, ``network.safetensors``, ``vocabulary.json`` and
-            the card are replaced one by one, the weights last. Everything else stays, and so does
-            a ``README.md`` that is no card of this library.
+        folder: where to. In a folder that exists, the card and ``network.safetensors`` are
+            replaced, never what symbolic links of these names point to. Everything else stays, and
+            so does a ``README.md`` that is no card of this library.
         vocabulary: the words of its token ids, by default the ``vocabulary`` of ``module``.
         facts: what the card says, such as ``{"Task": "move", "Success": "99.7% [99.5, 99.8]"}``.
         hub_id: ``user/name`` on the Hub; needs the extra ``hub`` and an account that is logged in.
@@ -132,26 +137,23 @@ def save_pretrained(
         UserError: for a module that no ``make_*`` function built, words that do not fit it, a
             ``folder`` that is none, a missing extra, or where the Hub refuses.
     """
-    folder, plan = Path(folder), _blueprint(module)
     if vocabulary is None:
         vocabulary = getattr(module, "vocabulary", None)
-    if vocabulary is not None:
-        _check_fit(vocabulary, plan.shapes, "the vocabulary")
+    folder, plan = Path(folder), _blueprint(module, vocabulary)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
             f"{folder} is no folder and cannot be made one ({error.strerror}): choose another"
         ) from None
-    (folder / WORDS).unlink(missing_ok=True)  # of the network that was here before
-    if vocabulary is not None:
-        words = {"words": list(vocabulary.words), "length": vocabulary.length}
-        write_json(folder / WORDS, words)
-    card = folder / CARD
-    if not card.exists() or LIBRARY in card.read_text(encoding="utf-8", errors="replace"):
-        with atomic_write(card) as temporary:
-            temporary.write_text(_card(plan, facts or {}), encoding="utf-8")
-    save(module, folder / WEIGHTS)
+    page, weights, words = (folder / name for name in (CARD, WEIGHTS, WORDS))
+    for path in (page, weights, words):
+        if path.is_symlink() or path == words:  # of the network that was here before
+            path.unlink(missing_ok=True)
+    if not page.is_file() or LIBRARY in page.read_text(encoding="utf-8", errors="replace"):
+        with atomic_write(page) as temporary:
+            temporary.write_text(card(plan, facts or {}), encoding="utf-8", errors="replace")
+    _write(module, weights, vocabulary)
     if hub_id is not None:
         _upload(folder, hub_id, **hub)
     return folder
@@ -186,39 +188,74 @@ def from_pretrained(
         folder = _downloaded(str(source), hub)
     module = load(folder / WEIGHTS, device=device, kind=kind)
     words = folder / WORDS
-    module.vocabulary = _vocabulary(words, module.network_config.shapes) if words.exists() else None
+    if module.vocabulary is None and words.is_file():
+        module.vocabulary = _vocabulary(read_json(words), module.network_config.shapes, words)
     return module
 
 
-def _blueprint(module: nn.Module) -> Blueprint:
-    """Return what a network was built by, or refuse what no ``make_*`` function built."""
+def _blueprint(module: nn.Module, vocabulary: Vocabulary | None) -> Blueprint:
+    """Return what a network was built by, or refuse what cannot be saved with these words."""
     plan = getattr(module, "network_config", None)
     if not isinstance(plan, Blueprint):
         raise UserError(
             f"cannot save {type(module).__name__}: only what a make_* function of "
             "ifo_grounding.networks built can be saved"
         )
+    _check_fit(vocabulary, plan.shapes, "the vocabulary")
     return plan
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Return the blueprint of a file, as JSON has it, and the weights."""
+def _write(module: nn.Module, path: Path, vocabulary: Vocabulary | None) -> str:
+    """Write a network and the words of its token ids, and return their checksum."""
+    plan = asdict(_blueprint(module, vocabulary))
+    plan["vocabulary"] = None if vocabulary is None else asdict(vocabulary)
+    texts = {"format": FORMAT, "network": json.dumps(plan, sort_keys=True)}
+    state = module.state_dict().items()
+    weights = {name: value.detach().cpu().contiguous() for name, value in state}
+    checksum = _checksum(texts, weights)
     try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
+        with atomic_write(path) as temporary:
+            save_file(weights, temporary, {**texts, "checksum": checksum})
+    except (OSError, SafetensorError) as error:
+        raise unwritable(path, _first_line(error)) from error
+    return checksum
+
+
+def _read(path: Path, checksum: str | None) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Return the blueprint and the words of a file, as JSON has them, and the weights."""
+    try:
+        with safe_open(regular_file(path) if path.exists() else path, framework="pt") as file:
+            texts = dict(file.metadata() or {})
+            if texts.get("format") != FORMAT:
                 raise UserError(
                     f"{path} is no network of this version of ifo-grounding (format "
-                    f"{metadata.get('format')!r}, expected {FORMAT!r}): train it again"
+                    f"{texts.get('format')!r}, expected {FORMAT!r}): train it again"
                 )
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return json.loads(metadata["network"]), weights
+        known = {texts.pop("checksum", None), checksum, None}
+        if not known <= {_checksum(texts, weights), None}:
+            raise ValueError("by its checksum, it is not what was saved")
+        if not all(weight.isfinite().all() for weight in weights.values()):
+            raise ValueError("weights are not finite")
+        return dict(json.loads(texts["network"])), weights
     except FileNotFoundError:
         raise UserError(f"{path} does not exist") from None
-    except (SafetensorError, OSError, KeyError, json.JSONDecodeError) as error:
+    except UserError:
+        raise
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise UserError(
-            f"{path} is damaged or no safetensors file ({error}): restore or retrain it"
+            f"{path} is damaged, another network or no safetensors file ({error}): restore it, or "
+            "delete it and train again"
         ) from None
+
+
+def _checksum(texts: Mapping[str, str], weights: Mapping[str, torch.Tensor]) -> str:
+    """Return a checksum of all that a file of a network holds."""
+    found = zlib.crc32(json.dumps(texts, sort_keys=True).encode())
+    for name, weight in sorted(weights.items()):
+        found = zlib.crc32(f"{name} {weight.dtype} {list(weight.shape)}".encode(), found)
+        found = zlib.crc32(weight.reshape(-1).view(torch.uint8).numpy().data, found)
+    return f"{found:08x}"
 
 
 def _key(value: Any) -> Any:
@@ -266,9 +303,8 @@ def _downloaded(hub_id: str, options: dict[str, Any]) -> Path:
         ) from None
 
 
-def _vocabulary(path: Path, shapes: Shapes) -> Vocabulary:
-    """Read the words of a network, or refuse what is damaged or another network's."""
-    found = read_json(path)
+def _vocabulary(found: Any, shapes: Shapes, path: str | Path) -> Vocabulary:
+    """Return words as JSON has them, or refuse what is damaged or another network's."""
     try:
         vocabulary = Vocabulary(found["words"], found["length"])
     except (TypeError, KeyError, AttributeError, UserError) as error:
@@ -280,47 +316,10 @@ def _vocabulary(path: Path, shapes: Shapes) -> Vocabulary:
     return vocabulary
 
 
-def _check_fit(vocabulary: Vocabulary, shapes: Shapes, name: str) -> None:
-    given = len(vocabulary), vocabulary.length
-    taken = shapes.vocabulary_size, shapes.instruction_length
-    if given[0] > taken[0] or given[1] != taken[1]:
+def _check_fit(vocabulary: Vocabulary | None, shapes: Shapes, name: str) -> None:
+    if vocabulary is not None and not shapes.fit(vocabulary):
         raise UserError(
-            f"{name} has {given[0]} token ids and {given[1]} per instruction, but the network was "
-            f"built for {taken[0]} and {taken[1]}: pass the vocabulary that it was built for"
+            f"{name} has {len(vocabulary)} token ids and {vocabulary.length} per instruction, but "
+            f"the network was built for {shapes.vocabulary_size} and {shapes.instruction_length}: "
+            "pass the vocabulary that it was built for"
         )
-
-
-def _card(plan: Blueprint, facts: Mapping[str, object]) -> str:
-    shapes = plan.shapes
-    rows = {
-        "Network": plan.kind,
-        "Preset": plan.config.preset,
-        "Images": "x".join(map(str, shapes.image_shape)),
-        "Token ids": f"{shapes.vocabulary_size}, {shapes.instruction_length} per instruction",
-        "Actions": shapes.n_actions,
-        **facts,
-    }
-    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items() if value is not None)
-    return f"""---
-{LIBRARY}
-license: mit
-tags: [torchrl, imitation-from-observation, language-grounding, reinforcement-learning]
----
-
-# A network of ifo-grounding
-
-It {ROLES[plan.kind]}.
-
-It was trained by the method of *Learning from Observation-Only Demonstration for Task-Oriented
-Language Grounding via Self-Examination* or an extension of it.
-
-| | |
-| --- | --- |
-{table}
-
-```python
-from ifo_grounding.networks import from_pretrained
-
-network = from_pretrained("path/to/this/folder")
-```
-"""

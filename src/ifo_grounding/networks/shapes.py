@@ -14,6 +14,7 @@ from ifo_grounding.attributes import attribute
 from ifo_grounding.channels import channels_last
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import NetworkConfig
+from ifo_grounding.tasks.vocabulary import Vocabulary
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,11 @@ n_actions=6, tile_size=None)
                     f"{hint!r} in its observation_spec, or a networks.Shapes"
                 )
         return cls(**{name: value for name, value in found.items() if value is not None})
+
+    def fit(self, words: object) -> bool:
+        """Whether this is a vocabulary whose token ids a network of these sizes reads."""
+        size, length = self.vocabulary_size, self.instruction_length
+        return isinstance(words, Vocabulary) and len(words) <= size and words.length == length
 
 
 def check_categorical(source: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +14,7 @@ from torchrl.objectives.common import LossModule
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import has_word_penalty, output_key
+from ifo_grounding.modules import has_word_penalty, in_mode, output_key
 
 
 @dataclass
@@ -80,7 +79,9 @@ class SupervisedLoss(LossModule):
         return list(dict.fromkeys([*self.own_keys, *vars(self.tensor_keys).values()]))
 
     def _require(self, tensordict: TensorDictBase) -> None:
-        """Raise :class:`UserError` where a key is missing, for ``get`` would return None."""
+        """Raise :class:`UserError` for an empty batch, or where a key is missing."""
+        if not tensordict.batch_size.numel():
+            raise UserError(f"the batch is empty: {type(self).__name__} takes a mean over samples")
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
         if missing:
             raise UserError(
@@ -88,16 +89,9 @@ class SupervisedLoss(LossModule):
                 "and the in_keys of the network change the names"
             )
 
-    @contextlib.contextmanager
-    def _mode(self) -> Iterator[None]:
+    def _mode(self) -> contextlib.AbstractContextManager[None]:
         """Put every part of the network into the mode of the loss, and back afterwards."""
-        before = {part: part.training for part in self.network.modules()}
-        self.network.train(self.training)
-        try:
-            yield
-        finally:
-            for part, was in before.items():
-                part.training = was
+        return in_mode(self.training, self.network)
 
     def _mean(self, values: Tensor, tensordict: TensorDictBase | None = None) -> Tensor:
         """Return the mean of a metric over the samples that a mask of TorchRL leaves."""

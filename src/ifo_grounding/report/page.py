@@ -67,7 +67,7 @@ def write_report(
         else:
             sections.append({"name": name, **_result(value)})
     for number, (name, picture) in enumerate(pictures.items(), 1):
-        file = "-".join([f"{number:02}", *re.findall("[a-z0-9]+", name.lower())])
+        file = "-".join([f"{number:02}", *re.findall("[a-z0-9]+", name.lower())])[:80]
         sections.append({"name": name, **_picture(picture, folder / "pictures" / file)})
     # Every text is escaped by the template: instructions and names come from users.
     pages = Environment(
@@ -82,7 +82,7 @@ def write_report(
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "results.json", plain(results))
     with atomic_write(folder / "index.html") as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="replace")
     return folder / "index.html"
 
 

@@ -86,9 +86,9 @@ def markdown_table(rows: Sequence[Row]) -> str:
     names = columns_of(rows)
     rule = ["---:" if _aligned_right(rows, name) else "---" for name in names]
     cells = [[_escaped(format_cell(row.get(name))) for name in names] for row in rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in [names, rule, *cells])
+    return "\n".join(f"| {' | '.join(row)} |" for row in [map(_escaped, names), rule, *cells])
 
 
 def _escaped(text: str) -> str:
     """Return a cell as markdown takes it."""
-    return INTERVAL.sub("[\\1,\u00a0\\2]", text.replace("|", r"\|"))
+    return INTERVAL.sub("[\\1,\u00a0\\2]", " ".join(text.split()).replace("|", r"\|"))

@@ -7,7 +7,6 @@ at an iteration's end holds no generator states.
 from __future__ import annotations
 
 import json
-import shutil
 import time
 import zipfile
 from collections.abc import Collection, Mapping
@@ -17,7 +16,7 @@ from typing import Any
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.files import atomic_write
+from ifo_grounding.files import atomic_write, unwritable
 
 FORMAT = "ifo-grounding checkpoint 2"
 
@@ -101,11 +100,7 @@ class Checkpoint:
             with atomic_write(self.path) as temporary:
                 torch.save(content, temporary)
         except (OSError, RuntimeError) as error:  # PyTorch's writer raises a RuntimeError
-            free = f"{shutil.disk_usage(self.path.parent).free / 1e6:,.0f} MB are free there"
-            raise UserError(
-                f"{self.path} cannot be written ({_reason(error)}; {free}): make room, and run the "
-                "same again to go on"
-            ) from error
+            raise unwritable(self.path, _reason(error)) from error
 
     def load(self) -> dict[str, Any] | None:
         """Restore all parts and return the progress, or None where there is no checkpoint.

@@ -131,9 +131,15 @@ def self_examine(
         Metrics of each iteration.
 
     Raises:
-        UserError: where the env exposes its true state, or has no learned reward, or where the best
-            policy is to be selected with ``adversarial`` but without ``held_out``.
+        UserError: where the env exposes its true state, or has no learned reward, where ``policy``
+            is no actor, or where the best one is to be selected with ``adversarial`` but without
+            ``held_out``.
     """
+    if not isinstance(policy, ProbabilisticTensorDictSequential):
+        raise UserError(
+            f"the policy must be an actor, as make_policy gives, got {type(policy).__name__}: of "
+            "others before an actor make one by ProbabilisticTensorDictSequential(*others, *actor)"
+        )
     _check(env, config, adversarial, held_out)
     policy.eval()
     value.eval()

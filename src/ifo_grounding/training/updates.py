@@ -39,10 +39,15 @@ def decay_towards_origin(optimizer: torch.optim.Optimizer, module: nn.Module) ->
 
 
 def total_loss(losses: TensorDictBase) -> Tensor:
-    """Add up all entries named ``loss_*``."""
-    return torch.stack(
-        [value.mean() for key, value in losses.items() if str(key).startswith("loss_")]
-    ).sum()
+    """Add up all entries named ``loss_*``, of which there has to be one."""
+    found: Any = getattr(losses, "items", dict)()
+    named = [value.mean() for key, value in found if str(key).startswith("loss_")]
+    if not named:
+        raise UserError(
+            "a loss must return a TensorDict with entries named loss_*, got "
+            f'{type(losses).__name__} without: return TensorDict({{"loss_mine": loss}})'
+        )
+    return torch.stack(named).sum()
 
 
 def update(
