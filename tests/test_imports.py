@@ -15,8 +15,8 @@ from ifo_grounding import keys
 
 PACKAGE = Path(keys.__file__).parent
 ORDER = (
-    ("keys", "errors", "seeding", "files", "machine", "allocation", "distinct", "mosaic"),
-    ("progress",),
+    ("keys", "errors", "seeding", "files", "machine", "allocation"),
+    ("channels", "distinct", "mosaic", "progress"),
     ("world",),
     ("tasks",),
     ("attributes", "modules", "episodes"),

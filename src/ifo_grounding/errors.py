@@ -40,8 +40,9 @@ def whole(name: str, value: object) -> int:
 def at_least_one(name: str, value: object) -> int:
     """Return a whole number that counts something, or refuse what is none."""
     number = whole(name, value)
-    if number < 1:
-        raise UserError(f"{name} must be at least 1, got {number}")
+    if not 1 <= number < 2**63:
+        bound = "at least 1" if number < 1 else "below 2**63"
+        raise UserError(f"{name} must be {bound}, got {number}")
     return number
 
 

@@ -7,6 +7,8 @@ import hashlib
 import torch
 from torch import Tensor
 
+from ifo_grounding.errors import whole
+
 STREAMS = ("training", "validation", "evaluation")
 """Disjoint streams of scenes (choices are made on validation, results on evaluation)."""
 
@@ -17,7 +19,7 @@ def derive(seed: int, *names: object) -> int:
     >>> derive(0, "env") == derive(0, "env"), derive(0, "env") == derive(0, "policy")
     (True, False)
     """
-    text = "/".join([str(int(seed)), *map(str, names)])
+    text = "/".join([str(whole("seed", seed)), *map(str, names)])
     digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
     return int.from_bytes(digest, "little") >> 1
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
+from functools import partial
 
+import gymnasium
 import pytest
 import torch
+from gymnasium.vector import VectorEnv
 from tensordict import TensorDict
 
+from envs.dial import MARKS, Dial
 from envs.stepping import choose, everything, scenes
-from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.data import babyai
+from ifo_grounding.envs import PickAndPlaceEnv, from_gymnasium
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
 from ifo_grounding.tasks import (
@@ -19,6 +25,7 @@ from ifo_grounding.tasks import (
     Plan,
     Scene,
     SceneStream,
+    Vocabulary,
     expert,
     grammar,
 )
@@ -147,6 +154,34 @@ def own(env, text, **more) -> TensorDict:
     return TensorDict({"scene": scene, "instruction": tokens, **more}, [env.num_envs])
 
 
+def reachable(start) -> list:
+    """All that public names lead to, from object to object."""
+    found, waiting = {}, [start]
+    while waiting:
+        one = waiting.pop()
+        if id(one) in found:
+            continue
+        found[id(one)] = one
+        if isinstance(one, dict | list | tuple):
+            waiting += one.values() if isinstance(one, dict) else one
+        elif type(one).__module__.split(".")[0] in ("ifo_grounding", "gymnasium", "minigrid"):
+            for name in {*dir(one)} - {"truth"}:
+                with contextlib.suppress(Exception):
+                    waiting += [] if name.startswith("_") else [getattr(one, name)]
+    return [*found.values()]
+
+
+def dials(**options):
+    words = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS])
+    return from_gymnasium(Dial, vocabulary=words, image="view", instruction="task", **options)
+
+
+def rooms(**options):
+    pytest.importorskip("minigrid")
+    words = Vocabulary(["go", "to", "the", "red", "ball"])
+    return from_gymnasium(babyai("GoToRedBallGrey", mission="none"), vocabulary=words, **options)
+
+
 def test_a_reset_takes_one_s_own_sentence():
     env = PickAndPlaceEnv("move", 64, seed=0)
     first = env.reset().clone()
@@ -162,9 +197,11 @@ def test_a_reset_takes_one_s_own_sentence():
     assert (paid[suits] >= 1).all()
     with pytest.raises(UserError, match="'put it' is no sentence of move"):
         env.reset(own(env, "put it"))
-    # What a past observation shows is no wish.
-    past = own(env, "move to the red circle", pixels=td["pixels"])
-    assert torch.equal(env.reset(past)["instruction"], first["instruction"])
+    anywhere = env.reset(own(env, "move to the red circle").exclude("scene"))
+    assert set(VOCABULARY.decode(anywhere["instruction"])) == {"move to the red circle"}
+    for name in ("pixels", "done"):  # what a past observation shows is no wish
+        past = own(env, "move to the red circle", scene=torch.arange(64), **{name: td[name]})
+        assert torch.equal(env.reset(past)["instruction"], first["instruction"])
 
 
 def test_another_sentence_amid_an_episode_is_refused():
@@ -183,20 +220,23 @@ def test_without_instructions_there_is_no_goal_and_no_reward():
     assert not rollout["next", "reward"].any()
 
 
-def test_a_learner_s_environment_hides_what_is_true():
-    """Neither its attributes nor its specs hold a state; what it keeps to itself, no goal."""
-    env = PickAndPlaceEnv("pick", 4, seed=0, instructed=False)
+@pytest.mark.parametrize("make", [partial(PickAndPlaceEnv, "pick"), dials, rooms])
+def test_a_learner_s_environment_hides_what_is_true(make):
+    """No public name leads to a state, a goal or the world; what is kept apart holds no goal."""
+    env = make(num_envs=4, seed=0, instructed=False)
     env.rollout(3)
-    names = {*vars(env), *vars(PickAndPlaceEnv)} - {"truth"}
-    values = [getattr(env, name) for name in names if not name.startswith("_")]
-    values += [v for value in values for v in getattr(value, "__dict__", {}).values()]
-    assert not any(isinstance(v, WorldState | Scene | Plan | Goal | SceneStream) for v in values)
+    hidden = WorldState | Scene | Plan | Goal | SceneStream | gymnasium.Env | VectorEnv
+    assert not [one for one in reachable(env) if isinstance(one, hidden)]
     for spec in (env.output_spec, env.input_spec):
         parts = {part for key in spec.keys(True, True) for part in key}
         assert not {"state", "objects", "instruction"} & parts
+    pickled = pickle.dumps(env)
+    assert b"to the" not in pickled  # nor any sentence of a room
+    if make in (dials, rooms):
+        return
     with pytest.raises(UserError, match="keeps its true state to itself"):
         _ = env.truth
-    for kept in (env, pickle.loads(pickle.dumps(env))):
+    for kept in (env, pickle.loads(pickled)):
         scenes = [kept._simulator.scene, kept._simulator.stream.scenes(torch.arange(50))]
         assert not any(s.instruction.any() or s.wanted.objects.any() for s in scenes)
 

@@ -124,12 +124,17 @@ def test_render_draws_every_world_large():
         ({"task": "fly"}, "unknown task 'fly': choose one of 'move', 'move-udlr'"),
         ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
         ({"max_steps": 2.5}, "max_steps must be a whole number, got 2.5"),
+        ({"max_steps": 10**30}, r"max_steps must be below 2\*\*63, got 1000"),
+        ({"seed": 1.5}, "seed must be a whole number, got 1.5"),
+        ({"instructed": "no"}, "instructed 'no': choose one of True, False"),
+        ({"expose_state": "no"}, "expose_state 'no'"),
+        ({"holdout_visible": "no"}, "holdout_visible 'no'"),
         ({"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
     ],
 )
 def test_bad_arguments_are_refused(wrong, said):
     with pytest.raises(UserError, match=said):
-        PickAndPlaceEnv(**wrong)
+        PickAndPlaceEnv(**wrong).reset()
 
 
 def moved(env):

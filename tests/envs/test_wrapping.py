@@ -6,6 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+from gymnasium.wrappers import FrameStackObservation
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
@@ -14,6 +16,7 @@ from ifo_grounding.data import collect_transitions
 from ifo_grounding.envs import from_gymnasium, wrapping
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, success_rate
+from ifo_grounding.networks import make_policy
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
 
 WORDS = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS], length=6)
@@ -162,12 +165,20 @@ def test_words_that_nobody_taught_can_be_left_out():
 
 
 class Odd(Dial):
-    def __init__(self, view, action_space=Dial.action_space):
+    def __init__(self, view, task="turn the dial to one"):
         super().__init__()
-        self.view, self.action_space = view, action_space
+        self.seen = {"view": view, "task": task}
 
     def _observe(self):
-        return {"view": self.view, "task": "turn the dial to one"}
+        return self.seen
+
+
+def like(**parts):
+    """A dial of which some parts are others."""
+    return type("Like", (Dial,), parts)
+
+
+SAME, GREY = Dial(), np.zeros((20, 28), np.uint8)
 
 
 @pytest.mark.parametrize(
@@ -180,19 +191,24 @@ class Odd(Dial):
         (Dial, {"num_envs": 0}, "num_envs"),
         (Dial, {"stop": 3}, "stop must be an action 0..2 or 'add', got 3"),
         (Dial, {"stop": 2.0}, "stop must be a whole number, got 2.0"),
-        (Dial, {"stop": "press"}, "stop"),
+        (Dial, {"stop": "press"}, r"stop must be an action 0\.\.2 or 'add', got 'press'"),
         (Dial, {"vocabulary": ["turn"]}, "vocabulary is a Vocabulary.*got list"),
         (Dial(), {}, "its class, got Dial"),
         (lambda: "dial", {}, "a world is a gymnasium.Env, got str"),
         (Dial, {"stream": "test"}, "stream"),
         (Dial, {"max_steps": 3}, "in your function"),
         (lambda: Odd(np.zeros((20, 28, 3))), {}, "bytes .* float64"),
-        (lambda: Odd(np.zeros((20, 28, 5), np.uint8)), {}, "channels"),
-        (
-            lambda: Odd(np.zeros((20, 28), np.uint8), gymnasium.spaces.Box(0, 1, (2,))),
-            {},
-            "Discrete",
-        ),
+        (partial(Odd, GREY, np.array([3, 1])), {}, r"is text, got ndarray array\(\[3, 1\]\)"),
+        (partial(Odd, GREY, None), {}, "an instruction is text, got NoneType"),
+        (lambda: gymnasium.Wrapper(SAME), {"num_envs": 2}, "returned the same one twice"),
+        (like(action_space=MultiDiscrete([3, 2])), {}, r"index\(a, \(3, 2\)\)\), Discrete\(6\)"),
+        (like(action_space=MultiBinary(3)), {}, r"index\(a, \(2, 2, 2\)\)\), Discrete\(8\)"),
+        (like(action_space=Box(0, 1, (2,))), {}, "TransformAction.*continuous ones are not"),
+        (like(reset=lambda self, seed: Dial.reset(self)[0]), {}, "Like.reset must return .* dict"),
+        (like(reset=lambda self: Dial.reset(self)), {}, "Like.reset takes no seed"),
+        (Dial, {"instructed": "no"}, "instructed 'no': choose one of True, False"),
+        (Dial, {"skip_unknown": "no"}, "skip_unknown 'no'"),
+        (Dial, {"processes": "no"}, "processes 'no'"),
     ],
 )
 def test_worlds_that_do_not_fit_are_refused(make, options, said):
@@ -200,10 +216,56 @@ def test_worlds_that_do_not_fit_are_refused(make, options, said):
         from_gymnasium(make, **{"seed": 0, **DIAL, **options})
 
 
+def outcome(reward=0.0, **seen):
+    return lambda self, action: ({**self._observe(), **seen}, reward, False, False, {})
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        (outcome(None), "Like pays None: a reward is one finite number"),
+        (outcome(float("nan")), "Like pays nan"),
+        (outcome(["a", 2.0]), "Like pays"),
+        (outcome(task="press"), "Like changed in an episode, from 'turn the dial .* to 'press'"),
+        (lambda self, action: Dial.step(self, action)[:4], "Like.step must return .* 4 values"),
+    ],
+)
+def test_steps_that_do_not_fit_are_refused(step, said):
+    env = from_gymnasium(like(step=step), seed=0, **DIAL)
+    with pytest.raises(UserError, match=said):
+        env.rollout(1)
+
+
+def test_actions_are_numbered_from_0_and_a_reward_may_be_an_array():
+    def step(self, action):
+        seen, reward, *rest = Dial.step(self, action - 1)
+        return seen, np.array([reward]), *rest
+
+    env = from_gymnasium(
+        like(action_space=Discrete(3, start=1), step=step), num_envs=3, seed=0, stop=PRESS, **DIAL
+    )
+    rolled = [each.rollout(9, knows) for each in (env, dials(3, stop=PRESS))]
+    assert (rolled[0] == rolled[1]).all() and rolled[0]["next", "reward"].any()
+
+
+def test_a_sentence_of_ones_own_is_refused_or_obeyed():
+    own = WORDS.encode("turn the dial to one").expand(3, -1)
+    env = dials(3)
+    with pytest.raises(UserError, match="the world sets it"):
+        env.step(env.rand_action(env.reset().set("instruction", own)))
+    with pytest.raises(UserError, match="the world sets it"):
+        env.reset(TensorDict({"instruction": own}, [3]))
+    free = dials(3, instructed=False, stop=PRESS)
+    begun = free.reset().set("instruction", own)
+    obeyed = free.rollout(9, knows, auto_reset=False, tensordict=begun)
+    assert (obeyed["instruction"] == own.unsqueeze(1)).all()
+    assert (shown(obeyed["next", "pixels"][:, -1]) == 0).any()
+
+
 def test_an_image_keeps_its_size():
     world = Odd(np.zeros((20, 28, 3), np.uint8))
     env = from_gymnasium(lambda: world, seed=0, **DIAL)
-    world.view = np.zeros((20, 30, 3), np.uint8)
+    world.seen["view"] = np.zeros((20, 30, 3), np.uint8)
     with pytest.raises(UserError, match=r"was \[3, 20, 28\] and is now \[3, 20, 30\]"):
         env.reset()
 
@@ -228,11 +290,23 @@ def test_it_says_which_action_is_the_stop(stop, named):
     assert (report.kept[PRESS] > 0) == (named == PRESS)
 
 
-@pytest.mark.parametrize("shape", [(20, 28), (1, 20, 28), (20, 28, 1), (3, 20, 28)])
-def test_images_come_in_every_usual_order(shape):
+@pytest.mark.parametrize(
+    ("shape", "channels"),
+    [
+        *([(20, 28), 1], [(1, 20, 28), 1], [(20, 28, 1), 1], [(3, 20, 28), 3]),
+        *([(20, 28, 12), 12], [(12, 20, 28), 12], [(4, 20, 28, 3), 12], [(4, 3, 20, 28), 12]),
+    ],
+)
+def test_images_come_in_every_usual_order(shape, channels):
     env = from_gymnasium(lambda: Odd(np.zeros(shape, np.uint8)), seed=0, **DIAL)
-    channels = 3 if 3 in shape else 1
     assert env.reset()["pixels"].shape == (1, channels, 20, 28)
+
+
+def test_gymnasium_s_stacked_frames_are_channels():
+    env = from_gymnasium(lambda: FrameStackObservation(Dial(), 2), seed=0, **DIAL)
+    seen = env.rollout(3, make_policy(env))["next"]
+    assert torch.equal(seen["pixels"][0, 1:, :3], seen["pixels"][0, :-1, 3:])
+    assert WORDS.decode(seen["instruction"][0, :1])[0].startswith("turn the dial")
 
 
 def test_episodes_that_begin_in_inference_mode_go_on_outside():

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ifo_grounding.channels import channels_last
 from ifo_grounding.errors import UserError, check_below, optional
 from ifo_grounding.files import regular_file
 from ifo_grounding.tasks.vocabulary import MOST_WORDS, Vocabulary, words_of
@@ -21,8 +22,6 @@ PIECE_BYTES = 16 << 20
 MOST_FRAMES = 100_000
 MOST_BYTES = 1 << 30
 """What an episode may hold in a file: small files can claim a lot."""
-LEAST_SIDE = 5
-"""Arrays whose last axis alone is shorter than this are taken for images with colours last."""
 
 Name = str | int
 Frames = Tensor | np.ndarray
@@ -141,7 +140,7 @@ def _checked(name: Name, given: Frames) -> Tensor:
             "least one frame; C is 1 for grey, 3 for colours, 4 with alpha; of floats in 0..1 "
             "np.round(255 * frames).astype(np.uint8)"
         )
-    if shape[-1] < LEAST_SIDE <= min(shape[1:3]):
+    if channels_last(shape):
         raise UserError(
             f"episode {name!r} has images {shape[1:]}, with the colours last: give "
             "[T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"

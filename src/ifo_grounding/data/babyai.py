@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stdout
 from io import StringIO
 from multiprocessing import get_context
+from types import SimpleNamespace
 from typing import Any, Literal, cast, overload
 
 import gymnasium
@@ -81,7 +82,12 @@ class _Room(gymnasium.Wrapper):
         """Begin an episode in a new room."""
         self._earned = 0.0
         with redirect_stdout(StringIO()):
-            return self.env.reset(**options)
+            seen, info = self.env.reset(**options)
+        if self.mission == "none":
+            # In place of the mission, one of no words that no action fulfils.
+            self.level.instrs = SimpleNamespace(verify=str, update_objs_poss=list)
+            self.level.mission = self.level.surface = seen["mission"] = ""
+        return seen, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take an action; a room that does not end with its mission ends with its time."""

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
+from ifo_grounding.channels import channels_first
 from ifo_grounding.data._episodes import Episode, check_size, open_table, read_table
-from ifo_grounding.data._images import MODES, stack_images
+from ifo_grounding.data._images import stack_images
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import DAMAGED
 from ifo_grounding.data.pictures import rgb, written_sentences
@@ -136,7 +137,7 @@ def _text(value: Any) -> str:
 def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
     """Return images as they were before they were stored, in the order [T + 1, C, H, W].
 
-    Orders are told apart as ``from_gymnasium`` does; what is neither stays as it is.
+    Orders are told apart as ``from_gymnasium`` does; what is no image stays as it is.
     """
     from minari.dataset.minari_storage import is_image_space
 
@@ -144,11 +145,7 @@ def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
         named = ((f"image {at}", bytes(row)) for at, row in enumerate(rows))
         return stack_images(named, (*space.shape, 1)[2])
     frames = np.stack(rows).reshape(-1, *space.shape)
-    if frames.ndim == 3:
-        return frames[:, None]
-    if frames.ndim == 4 and frames.shape[-1] in MODES and frames.shape[1] not in MODES:
-        return frames.transpose(0, 3, 1, 2)
-    return frames
+    return channels_first(frames) if frames.ndim > 2 else frames
 
 
 @contextlib.contextmanager

@@ -30,6 +30,8 @@ class NumberedEnv(EnvBase):
 
     steps_on = True
     """A row may be stepped after its end: it goes on, or stays as it is."""
+    own_sentence: str
+    """What to do with a sentence of one's own."""
 
     def __init__(
         self,
@@ -75,3 +77,19 @@ class NumberedEnv(EnvBase):
         if bool(((numbers < 0) & (True if mask is None else mask)).any()):
             raise UserError("scene numbers start at 0")
         return mask, numbers
+
+    def _wish(self, tensordict: TensorDictBase | None) -> Tensor | None:
+        """Return the instructions that a reset asks for; those of an observation are over."""
+        given: Any = {} if tensordict is None else tensordict
+        if not self.instructed or keys.PIXELS in given or "done" in given:
+            return None
+        return given.get(keys.INSTRUCTION, None)
+
+    def _check_instruction(self, given: Tensor | None, asked: Tensor) -> None:
+        """Refuse another instruction than the episode's; on a GPU that would wait for it."""
+        if given is None or asked.device.type != "cpu":
+            return
+        if given.shape != asked.shape or bool((given.cpu() != asked).any()):
+            raise UserError(
+                f"the instruction is another than the episode began with: {self.own_sentence}"
+            )

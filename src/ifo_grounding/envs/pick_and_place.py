@@ -15,7 +15,7 @@ from torchrl.data import Composite
 from ifo_grounding import keys
 from ifo_grounding.envs.base import DONE, NumberedEnv
 from ifo_grounding.envs.simulator import RENDER_TILE_SIZE, Simulator
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.tasks.goals import MAX_STEPS
 from ifo_grounding.tasks.scenes import Scene, SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
@@ -53,8 +53,8 @@ class PickAndPlaceEnv(NumberedEnv):
         UserError: on an unknown name or an impossible size.
 
     A reset tensordict may hold ``"scene"``, int64 [*B, 1], the numbers of the scenes to begin with,
-    and beside it, where it holds no ``"pixels"``, an ``"instruction"`` of the task, int64 [*B, 16],
-    to follow there in place of the scene's own. One that does not suit its scene is never rewarded.
+    and, where it is no observation (``"pixels"``, ``"done"``), an ``"instruction"`` of the task,
+    int64 [*B, 16], in place of the scene's own. One that does not suit its scene is never rewarded.
 
     >>> env = PickAndPlaceEnv("pick-out", num_envs=4, seed=0)
     >>> rollout = env.rollout(40, break_when_any_done=False)
@@ -64,6 +64,10 @@ class PickAndPlaceEnv(NumberedEnv):
 
     stop_action = keys.STOP
     """The action by which a policy ends an episode."""
+    own_sentence = (
+        "give it to reset(), in a TensorDict of 'scene' (env.scene_numbers for the same scenes) "
+        "and 'instruction'"
+    )
 
     def __init__(
         self,
@@ -93,6 +97,7 @@ class PickAndPlaceEnv(NumberedEnv):
             max_steps=max_steps,
         )
         super().__init__(num_envs, VOCABULARY, instructed, device)
+        check_choice("expose_state", expose_state, (True, False))
         self.tile_size, self.expose_state = tile_size, expose_state
         seed = secrets.randbits(31) if seed is None else seed
         self._simulator = Simulator(options, num_envs, seed, tile_size, self.device)
@@ -155,12 +160,9 @@ class PickAndPlaceEnv(NumberedEnv):
         return Composite(parts, shape=self.batch_size, device=self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        given: Any = {} if tensordict is None else tensordict
         mask, numbers = self._asked(tensordict)
         self._simulator.reset(mask, numbers)
-        tokens = given.get(keys.INSTRUCTION, None) if self.instructed else None
-        # The instruction of an observation is over.
-        if tokens is not None and numbers is not None and keys.PIXELS not in given:
+        if (tokens := self._wish(tensordict)) is not None:
             every = torch.arange(self.num_envs, device=self.device)
             rows = every if mask is None else every[mask]
             self._simulator.ask(rows, tokens[rows])
@@ -195,7 +197,8 @@ class PickAndPlaceEnv(NumberedEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.instructed:
-            self._check_instruction(tensordict.get(keys.INSTRUCTION, None))
+            asked = self._simulator.instruction
+            self._check_instruction(tensordict.get(keys.INSTRUCTION, None), asked)
         success, terminated, truncated = self._simulator.step(tensordict.get(keys.ACTION))
         result = self._observe()
         result[keys.REWARD] = success.float().unsqueeze(-1)
@@ -203,17 +206,6 @@ class PickAndPlaceEnv(NumberedEnv):
         result["terminated"] = terminated.unsqueeze(-1)
         result["truncated"] = truncated.unsqueeze(-1)
         return result
-
-    def _check_instruction(self, given: Tensor | None) -> None:
-        """Refuse another instruction than the episode's; on a GPU that would wait for it."""
-        if given is None or given.device.type != "cpu":
-            return
-        asked = self._simulator.instruction
-        if given.shape != asked.shape or bool((given != asked).any()):
-            raise UserError(
-                "the instruction is another than the episode began with: give it to reset(), in a "
-                "TensorDict of 'scene' (env.scene_numbers for the same scenes) and 'instruction'"
-            )
 
     def _observe(self) -> TensorDict:
         result = TensorDict({}, batch_size=self.batch_size, device=self.device)

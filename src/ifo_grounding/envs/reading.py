@@ -2,19 +2,47 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
+import math
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 
 from ifo_grounding import keys
-from ifo_grounding.errors import UserError
+from ifo_grounding.channels import channels_first
+from ifo_grounding.errors import UserError, whole
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 ENDED = "ended"
 """Whether a world has terminated, whether it was truncated, and whether the policy stopped."""
 ADD = "add"
-CHANNELS = (1, 3, 4)
+RESET = "reset", "observation, info"
+STEP = "step", "observation, reward, terminated, truncated, info"
+
+
+def numbered_actions(space: gymnasium.Space, stop: int | str | None) -> tuple[int, int | None]:
+    """Return how many actions there are, and the number of the stop, or refuse them."""
+    if not isinstance(space, spaces.Discrete):
+        raise UserError(f"actions must be Discrete, got {space}: wrap it by {_wrapper_of(space)}")
+    count = int(space.n)
+    if stop in (None, ADD):
+        return count + (stop == ADD), count if stop == ADD else None
+    if isinstance(stop, str) or whole("stop", stop) not in range(count):
+        raise UserError(f"stop must be an action 0..{count - 1} or {ADD!r}, got {stop!r}")
+    return count, int(stop)
+
+
+def _wrapper_of(space: gymnasium.Space) -> str:
+    """Return the line that makes actions of another space ``Discrete``."""
+    said = ", with a list CHOICES of actions: continuous ones are not supported"
+    chosen, count = "CHOICES[a]", "len(CHOICES)"
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
+        sizes = tuple(getattr(space, "nvec", np.full(space.shape, 2)).ravel().tolist())
+        chosen, count, said = f"np.array(np.unravel_index(a, {sizes}))", str(math.prod(sizes)), ""
+    return f"gymnasium.wrappers.TransformAction(world, lambda a: {chosen}, Discrete({count})){said}"
 
 
 class Reading(gymnasium.Wrapper):
@@ -38,38 +66,32 @@ class Reading(gymnasium.Wrapper):
         if not isinstance(env, gymnasium.Env):
             raise UserError(f"a world is a gymnasium.Env, got {type(env).__name__}")
         super().__init__(env)
-        if not isinstance(env.action_space, gymnasium.spaces.Discrete) or env.action_space.start:
-            raise UserError(
-                f"actions must be Discrete from 0, got {env.action_space}: wrap the world so that "
-                "they are"
-            )
+        self._name = type(env.unwrapped).__name__
+        count, self.stop = numbered_actions(env.action_space, stop)
+        own: Any = env.action_space
+        self._count, self._start = int(own.n), int(own.start)
+        self.action_space = spaces.Discrete(count)
+        taken = inspect.signature(env.unwrapped.reset).parameters.values()
+        if not any(each.name == "seed" or each.kind is each.VAR_KEYWORD for each in taken):
+            raise UserError(f"{self._name}.reset takes no seed: add seed=None, options=None")
         self.vocabulary, self.skip_unknown = vocabulary, skip_unknown
         self.image, self.instruction, self.instructed = image, instruction, instructed
-        count = int(env.action_space.n)
-        self._added = count if stop == ADD else None
-        self.stop = count if stop == ADD else stop
-        self.action_space = gymnasium.spaces.Discrete(count + (stop == ADD))
-        if self.stop is not None and self.stop not in range(self.action_space.n):
-            raise UserError(f"stop must be an action 0..{count - 1} or {ADD!r}, got {stop!r}")
         self._last: dict[str, np.ndarray] | None = None
-        observation, info = env.reset(seed=0)
-        self._shape = self._pixels(observation).shape
-        spaces: dict[str, gymnasium.Space] = {
-            keys.PIXELS: gymnasium.spaces.Box(0, 255, self._shape, np.uint8),
-            ENDED: gymnasium.spaces.MultiBinary(3),
+        self._shape = self._pixels(self._begin(seed=0)).shape
+        parts: dict[str, gymnasium.Space] = {
+            keys.PIXELS: spaces.Box(0, 255, self._shape, np.uint8),
+            ENDED: spaces.MultiBinary(3),
         }
         if instructed:
-            self._tokens = self._encode(observation, info)
-            words = gymnasium.spaces.Box(0, len(vocabulary) - 1, self._tokens.shape, np.int64)
-            spaces[keys.INSTRUCTION] = words
-        self.observation_space = gymnasium.spaces.Dict(spaces)
+            high, shape = len(vocabulary) - 1, self._tokens.shape
+            parts[keys.INSTRUCTION] = spaces.Box(0, high, shape, np.int64)
+        self.observation_space = spaces.Dict(parts)
 
-    def reset(self, **options: Any) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode."""
-        observation, info = self.env.reset(**options)
-        if self.instructed:
-            self._tokens = self._encode(observation, info)
-        self._last = self._seen(observation, False, False, False)
+        self._last = self._seen(self._begin(seed), False, False, False)
         return self._last, {}
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
@@ -78,54 +100,81 @@ class Reading(gymnasium.Wrapper):
             raise UserError("there is no episode yet: reset the environment first")
         if self._last[ENDED].any():
             return self._last, 0.0, False, False, {}
-        if int(action) == self._added:
+        if int(action) == self._count:  # the one that is added
             self._last = {**self._last, ENDED: np.array([0, 0, 1], dtype=np.int8)}
             return self._last, 0.0, False, False, {}
-        observation, reward, terminated, truncated, _ = self.env.step(int(action))
+        found = self._parts(self.env.step(self._start + int(action)), *STEP)
+        observation, reward, terminated, truncated, info = found
+        if self.instructed and self._said(observation, info) not in (None, self._sentence):
+            raise UserError(
+                f"the instruction of {self._name} changed in an episode, from {self._sentence!r} "
+                f"to {self._said(observation, info)!r}: an episode follows one, end it there"
+            )
         self._last = self._seen(observation, terminated, truncated, int(action) == self.stop)
-        return self._last, float(reward), False, False, {}
+        return self._last, self._paid(reward), False, False, {}
 
-    def _seen(self, observation: Any, *ended: bool) -> dict[str, np.ndarray]:
+    def _begin(self, seed: int | None) -> Any:
+        """Reset the world, note its instruction, and return the observation."""
+        observation, info = self._parts(self.env.reset(seed=seed), *RESET)
+        if not self.instructed:
+            return observation
+        self._sentence = said = self._said(observation, info)
+        if said is None:
+            raise UserError(
+                f"there is no instruction {self.instruction!r} in the observation "
+                f"({_names(observation)}) or in info ({_names(info)}): name it with instruction=..."
+            )
+        self._tokens = self.vocabulary.encode(said, skip_unknown=self.skip_unknown)[0].numpy()
+        return observation
+
+    def _parts(self, found: Any, method: str, names: str) -> Any:
+        """Return what a method of the world returned, if it is as Gymnasium has it."""
+        got = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
+        if got != f"{len(names.split())} values":
+            raise UserError(
+                f"{self._name}.{method} must return {names}, got {got}: wrap old worlds"
+            )
+        return found
+
+    def _paid(self, reward: Any) -> float:
+        with contextlib.suppress(TypeError, ValueError):
+            if math.isfinite(paid := float(np.asarray(reward).item())):
+                return paid
+        raise UserError(f"{self._name} pays {reward!r:.40}: a reward is one finite number")
+
+    def _seen(self, observation: Any, *ended: Any) -> dict[str, np.ndarray]:
         pixels = self._pixels(observation)
         if pixels.shape != self._shape:
             raise UserError(
                 f"the image was {list(self._shape)} and is now {list(pixels.shape)}: wrap the "
                 "world so that its size stays"
             )
-        seen = {keys.PIXELS: pixels, ENDED: np.array(ended, dtype=np.int8)}
+        seen = {keys.PIXELS: pixels, ENDED: np.array([*map(bool, ended)], dtype=np.int8)}
         return {**seen, keys.INSTRUCTION: self._tokens} if self.instructed else seen
 
     def _pixels(self, observation: Any) -> np.ndarray:
-        """Return the image, uint8 [C, H, W]."""
+        """Return the image, uint8 [C, H, W]; stacked frames [K, H, W, C] have K * C channels."""
         if self.image is not None and self.image not in _names(observation):
             raise UserError(
                 f"there is no image {self.image!r} in the observation ({_names(observation)}): "
                 "name it with image=..., or image=None where the observation is the image"
             )
         picture = np.asarray(observation if self.image is None else observation[self.image])
-        if picture.dtype != np.uint8 or picture.ndim not in (2, 3):
+        if picture.dtype != np.uint8 or picture.ndim not in (2, 3, 4):
             raise UserError(
-                f"images are bytes [H, W, C], [C, H, W] or [H, W], got {picture.dtype} "
-                f"{list(picture.shape)}: wrap the world so that it shows pixels"
+                f"images are bytes [H, W, C], [C, H, W] or [H, W], or a stack of them, got "
+                f"{picture.dtype} {list(picture.shape)}: wrap the world so that it shows pixels"
             )
-        if picture.ndim == 2:
-            return picture[None]
-        if picture.shape[0] in CHANNELS:
-            return np.ascontiguousarray(picture)
-        if picture.shape[-1] in CHANNELS:
-            return np.ascontiguousarray(picture.transpose(2, 0, 1))
-        raise UserError(f"an image has 1, 3 or 4 channels, got an array of {list(picture.shape)}")
+        return channels_first(picture[None])[0]
 
-    def _encode(self, observation: Any, info: dict[str, Any]) -> np.ndarray:
-        """Return the tokens of the instruction, int64 [L]."""
+    def _said(self, observation: Any, info: Any) -> str | None:
+        """Return the instruction that is said, of stacked observations the last one's."""
         found = [part for part in (observation, info) if self.instruction in _names(part)]
-        if not found:
-            raise UserError(
-                f"there is no instruction {self.instruction!r} in the observation "
-                f"({_names(observation)}) or in info ({_names(info)}): name it with instruction=..."
-            )
-        sentence = str(found[0][self.instruction])
-        return self.vocabulary.encode(sentence, skip_unknown=self.skip_unknown)[0].numpy()
+        said: Any = found[0][self.instruction] if found else None
+        said = said[-1] if isinstance(said, tuple) and said else said
+        if found and not isinstance(said, str | bytes):
+            raise UserError(f"an instruction is text, got {type(said).__name__} {said!r:.40}")
+        return said.decode() if isinstance(said, bytes) else said
 
 
 def _names(source: Any) -> list[str]:

@@ -15,9 +15,9 @@ from tensordict import TensorDict, TensorDictBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs.base import DONE, NumberedEnv
-from ifo_grounding.envs.reading import ADD, ENDED, Reading
+from ifo_grounding.envs.reading import ENDED, Reading
 from ifo_grounding.envs.simulator import check_actions
-from ifo_grounding.errors import UserError, at_least_one, check_choice, whole
+from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -42,8 +42,9 @@ def from_gymnasium(
 ) -> GymnasiumEnv:
     """Put a Gymnasium world behind the keys of this library.
 
-    The world has to show an image of bytes and to take actions of a ``Discrete`` space; its
-    instruction is a sentence in the observation or in ``info``. Episodes end as the world says,
+    The world has to show an image of bytes, or a stack of them, and to take actions of a
+    ``Discrete`` space, numbered from 0 here; its instruction is a sentence in the observation or in
+    ``info``, which stays throughout an episode. Episodes end as the world says,
     and its reward is the true one: for evaluation alone, which counts an episode as a success where
     its last step pays more than 0, and withheld where ``instructed=False``.
 
@@ -90,10 +91,9 @@ def from_gymnasium(
     torch.Size([2, 3, 48, 48])
     """
     check_choice("stream", stream, STREAMS)
-    if isinstance(stop, str):
-        check_choice("stop", stop, (ADD,))
-    elif stop is not None:
-        stop = whole("stop", stop)
+    flags = {"instructed": instructed, "skip_unknown": skip_unknown, "processes": processes}
+    for name, flag in flags.items():
+        check_choice(name, flag, (True, False))
     if not isinstance(vocabulary, Vocabulary):
         raise UserError(
             "vocabulary is a Vocabulary, such as that of the demonstrations or "
@@ -114,8 +114,13 @@ def from_gymnasium(
     reading = (vocabulary, image, instruction, instructed, stop, skip_unknown)
     makes = [functools.partial(_open, world, *reading)] * at_least_one("num_envs", num_envs)
     vector = AsyncVectorEnv if processes else SyncVectorEnv
-    worlds = vector(makes, autoreset_mode=AutoresetMode.DISABLED)
-    return GymnasiumEnv(worlds, vocabulary, instructed, stop, seed, stream, device)
+    worlds: Any = vector(makes, autoreset_mode=AutoresetMode.DISABLED)
+    if not processes and len({id(each.unwrapped) for each in worlds.envs}) < num_envs:
+        raise UserError(
+            "the function that makes the world returned the same one twice: let it make a new one, "
+            "such as lambda: MyWorld()"
+        )
+    return GymnasiumEnv(worlds, vocabulary, instructed, seed, stream, device)
 
 
 def _open(make: Make, *reading: Any) -> Reading:
@@ -136,23 +141,27 @@ def world_seed(seed: int, stream: str, number: int) -> int:
 class GymnasiumEnv(NumberedEnv):
     """What :func:`from_gymnasium` returns: a vector of worlds as :class:`Reading` reads them."""
 
+    own_sentence = (
+        "the world sets it. For a sentence of your own, make the environment with "
+        "instructed=False and set 'instruction' after its reset: nothing is paid there"
+    )
+
     def __init__(
         self,
         worlds: VectorEnv,
         vocabulary: Vocabulary,
         instructed: bool,
-        stop: int | str | None,
         seed: int | None,
         stream: str,
         device: torch.device | str | None,
     ) -> None:
         super().__init__(worlds.num_envs, vocabulary, instructed, device)
-        self.worlds, self.stream = worlds, stream
+        self._worlds, self.stream = worlds, stream
         self.scene_numbers = torch.full((self.num_envs,), -1)
         """Number of the scene that each row began with, int64 [num_envs]."""
         self._set_seed(seed)
         self.n_actions = int(worlds.single_action_space.n)  # type: ignore[attr-defined]
-        self.stop_action = self.n_actions - 1 if stop == ADD else stop
+        self.stop_action = worlds.get_attr("stop")[0]  # type: ignore[attr-defined]
         """The action by which a policy ends an episode, or None."""
         pixels = worlds.single_observation_space[keys.PIXELS]  # type: ignore[index]
         self._declare(pixels.shape, self.n_actions)
@@ -171,22 +180,27 @@ class GymnasiumEnv(NumberedEnv):
             self.scene_numbers = self.scene_numbers.index_copy(0, rows, numbers)
             numbered = self.scene_numbers.tolist()
             seeds: Any = [world_seed(self._seed, self.stream, number) for number in numbered]
-            self._seen, _ = self.worlds.reset(
-                seed=seeds, options={"reset_mask": mask.cpu().numpy()}
-            )
-        return self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in DONE})
+            given = {"reset_mask": mask.cpu().numpy()}
+            self._seen, _ = self._worlds.reset(seed=seeds, options=given)
+        shown = self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in DONE})
+        if (wish := self._wish(tensordict)) is not None:
+            self._check_instruction(wish[mask], shown[keys.INSTRUCTION][mask])
+        return shown
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get(keys.ACTION).cpu()
         check_actions(actions, self.num_envs, self.n_actions)
-        self._seen, reward, *_ = self.worlds.step(actions.numpy())
+        self._seen, reward, *_ = self._worlds.step(actions.numpy())
         terminated, truncated, stopped = self._seen[ENDED].astype(bool).T
         done = terminated | truncated | stopped
         terminated = terminated | stopped
         if not self.instructed:
             reward, terminated, truncated = np.zeros_like(reward), stopped, done & ~stopped
         flags = {"done": done, "terminated": terminated, "truncated": truncated}
-        return self._observed(reward=reward.astype(np.float32), **flags)
+        shown = self._observed(reward=reward.astype(np.float32), **flags)
+        if self.instructed:
+            self._check_instruction(tensordict.get(keys.INSTRUCTION, None), shown[keys.INSTRUCTION])
+        return shown
 
     def _observed(self, **columns: np.ndarray) -> TensorDict:
         """Return what is seen, with columns [num_envs] beside it."""
@@ -201,5 +215,5 @@ class GymnasiumEnv(NumberedEnv):
 
     def close(self, **options: Any) -> None:
         """Close the worlds."""
-        self.worlds.close()
+        self._worlds.close()
         super().close(**options)

@@ -11,12 +11,10 @@ from torchrl.data import Bounded, Categorical, OneHot
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
+from ifo_grounding.channels import channels_last
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.tasks.vocabulary import Vocabulary
-
-MOST_CHANNELS = 4
-"""Of a picture: red, green, blue and opacity. No picture is so narrow."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +42,7 @@ n_actions=6, tile_size=None)
             raise UserError(
                 f"image_shape must be (channels, height, width), got {self.image_shape}"
             )
-        channels, _, width = self.image_shape
-        if width <= MOST_CHANNELS < channels:
+        if channels_last(self.image_shape):
             raise UserError(
                 f"image_shape is (channels, height, width), and {tuple(self.image_shape)} looks "
                 "like one whose channels come last: permute images first, an environment's with "

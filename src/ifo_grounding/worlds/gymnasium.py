@@ -10,6 +10,7 @@ import gymnasium
 from hydra.utils import get_method
 
 from ifo_grounding.envs import GymnasiumEnv, from_gymnasium
+from ifo_grounding.envs.reading import numbered_actions
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import action_names
 from ifo_grounding.worlds.base import World
@@ -44,13 +45,10 @@ class Gymnasium(World):
     def __post_init__(self) -> None:
         if (self.id is None) == (self.factory is None):
             raise UserError("name the world by one of world.id=... and world.factory=...")
-        if isinstance(self.stop, str) and self.stop != "add":
-            raise UserError(f"world.stop is a number of an action, add or null, got {self.stop!r}")
         world = self._maker()()
-        count = int(getattr(world.action_space, "n", 0)) + (self.stop == "add")
+        count, self.stop_action = numbered_actions(world.action_space, self.stop)
         world.close()
         self.actions = self.names or action_names(count)
-        self.stop_action = count - 1 if isinstance(self.stop, str) else self.stop
 
     def simulator(self, num_envs: int, **options: Any) -> GymnasiumEnv:
         """Return worlds without instructions and rewards; see :class:`World`."""
