@@ -29,11 +29,9 @@ class Kinds:
     """How many cells are of each kind, [N, C]; 0 where a scene shows fewer than C."""
 
     def __len__(self) -> int:
-        """Return the number of scenes."""
         return len(self.features)
 
     def __getitem__(self, rows: Tensor | slice) -> Kinds:
-        """Return some of the scenes."""
         return Kinds(self.features[rows], self.place[rows], self.number[rows])
 
 
@@ -82,8 +80,6 @@ def distinct_pairs(
     Args:
         first: numbers below ``n_first``, int64 [*B].
         second: numbers below ``n_second``, int64, broadcast to [*B].
-        n_first: bound of the first.
-        n_second: bound of the second.
 
     Returns:
         The two numbers of each distinct pair, int64 [P] each, and which pair lies where, [*B].

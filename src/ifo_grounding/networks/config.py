@@ -97,11 +97,7 @@ class NetworkConfig:
 
     @classmethod
     def of(cls, kind: str, preset: str = "strong", **overrides: Any) -> NetworkConfig:
-        """Return the configuration of ``kind`` under ``preset``, with some values replaced.
-
-        Raises:
-            UserError: for an unknown kind, preset or name of a value.
-        """
+        """Return the configuration of ``kind`` under ``preset``, with some values replaced."""
         check_choice("kind of network", kind, INPUTS)
         check_choice("preset", preset, PRESETS)
         names = [field.name for field in fields(cls) if field.name != "preset"]

@@ -10,12 +10,7 @@ from torch import Tensor, nn
 
 from ifo_grounding.networks.cells import look_up
 from ifo_grounding.networks.layers import convolutions, init_before_relu
-from ifo_grounding.networks.patches import (
-    Windows,
-    as_float,
-    cells_of,
-    distinct_views,
-)
+from ifo_grounding.networks.patches import Windows, as_float, cells_of, distinct_views
 
 
 class ConvEncoder(nn.Module):
@@ -103,12 +98,9 @@ class PatchEncoder(nn.Module):
         return self.look_up(*cells_of(image, self.patch), grid)
 
     def look_up(self, patches: Tensor, index: Tensor, grid: tuple[int, int]) -> Tensor:
-        """Embed patches [U, C, P * P] once, and look them up: [N, F, h, w].
+        """Embed distinct patches [U, C, P * P], and look up which lies where: [N, F, h, w].
 
-        Args:
-            patches: distinct ones.
-            index: which of them lies where, int64 [N, h * w].
-            grid: h and w.
+        ``index`` is int64 [N, h * w], ``grid`` h and w.
         """
         pixels = as_float(self.complete(patches).flatten(1), self.embed.weight)
         return look_up(self.embed(pixels), index).unflatten(1, grid).movedim(-1, 1)

@@ -48,7 +48,6 @@ class WordMaps(nn.Module):
     much it counts for a map is its role, read from its place among the other words. In training,
     roles are read from instructions whose words were swapped (:func:`swap_words`), so that they
     cannot depend on which colour or form is meant.
-
     """
 
     word_penalty: Tensor | None = None
@@ -78,8 +77,7 @@ class WordMaps(nn.Module):
         self.register_buffer("usual", torch.zeros(vocabulary_size, maps))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs: not the penalty, a part of a graph."""
-        return {**self.__dict__, "word_penalty": None}
+        return {**self.__dict__, "word_penalty": None}  # it is a part of a graph
 
     def forward(self, seen: Appearance, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps' logits [N, maps, h * w] and the modifier [N, MODIFIER]."""
@@ -97,12 +95,7 @@ class WordMaps(nn.Module):
         return spoken.transpose(1, 2) @ evidence.transpose(1, 2), modifier
 
     def evidence(self, seen: Appearance, used: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return what words, by default all, say of colours and of form of each cell, [U, V] each.
-
-        Args:
-            seen: distinct cells.
-            used: the words, int64 [V].
-        """
+        """Return what words, all or those ``used``, say of colours and of form, [U, V] each."""
         about = [self.about_colour.weight, self.about_form.weight]
         colour, form = about if used is None else [look_up(words, used) for words in about]
         return seen.colour @ colour.T, seen.form @ form.T
@@ -110,11 +103,8 @@ class WordMaps(nn.Module):
     def listen(self, tokens: Tensor, used: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return how much each word counts for each map, [N, V, maps], and [N, MODIFIER].
 
-        What words usually count is taken off: it tells nothing of this instruction.
-
-        Args:
-            tokens: token ids [N, L].
-            used: the words, by default all, int64 [V]; the others count nothing.
+        What words usually count is taken off: it tells nothing of this instruction. Words of
+        ``tokens`` [N, L] that are not ``used``, int64 [V], count nothing.
         """
         weights, modifier = self.roles(tokens)
         usual = self.usual if used is None else self.usual[used]

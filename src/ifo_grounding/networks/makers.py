@@ -34,11 +34,8 @@ class Blueprint:
     """Everything that ``load`` needs to build a network again, but for its weights."""
 
     kind: str
-    """Which network."""
     shapes: Shapes
-    """What it was built for."""
     config: NetworkConfig
-    """Its sizes and choices."""
     options: dict[str, Any]
     """Keyword arguments of its ``make_*`` function: keys and the like."""
 
@@ -56,16 +53,8 @@ def build(
 ) -> Any:
     """Build a network in eval mode, its weights channels last: convolutions are twice as fast so.
 
-    Args:
-        kind: which network, one of :data:`INPUTS`.
-        network: its class, or a function that builds it.
-        source: what sizes are read from, see :meth:`Shapes.of`.
-        preset: ``"strong"`` or ``"paper"``.
-        options: the keyword arguments of the ``make_*`` function that are not named here.
-        device: where to build it.
-        seed: for initial weights; the caller's generators stay as they are.
-        overrides: values of :class:`NetworkConfig` to replace.
-        wrap: makes what is returned of the network, its ``in_keys`` and its ``out_keys``.
+    ``options`` are the keyword arguments of the ``make_*`` function that are not named here, and
+    ``wrap`` makes what is returned of the network, its ``in_keys`` and its ``out_keys``.
     """
     in_keys, inputs = options["in_keys"], INPUTS[kind]
     if isinstance(in_keys, str) or len(in_keys) != len(inputs):
@@ -110,7 +99,6 @@ def make_inverse(
 
     Args:
         in_keys: the image before and the image after, uint8 [*B, C, H, W].
-        out_key: where the logits go.
 
     >>> inverse = make_inverse(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> frame = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
@@ -193,7 +181,6 @@ def make_value(
     Args:
         init_from: a policy whose trunk's weights are copied (a warm start).
         in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
-        out_key: where the value goes.
 
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
     >>> value = make_value(shapes, init_from=make_policy(shapes, seed=0), seed=0)
@@ -270,7 +257,6 @@ def make_goal_classifier(
     Args:
         in_keys: the episode's first image and the present one, uint8 [*B, C, H, W], and the
             instruction, int64 [*B, L].
-        out_key: where the logit goes.
         init_from: a policy whose weights are copied (a warm start): the classifier then sees
             nothing of the first image, until it learns to.
 
@@ -306,7 +292,6 @@ def make_reward_model(
     Args:
         in_keys: the image, uint8 [*B, C, H, W], the instruction, int64 [*B, L], and the action,
             integer [*B].
-        out_key: where the logit goes.
         init_from: a policy whose trunk's weights are copied (a warm start, an extension of the
             paper). Self-examination leads a policy to what its reward model likes best, so that
             this has to know as much.

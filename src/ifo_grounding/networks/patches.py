@@ -84,14 +84,10 @@ def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
 
 @remembered
 def cells_of(image: Tensor, patch: int) -> tuple[Tensor, Tensor]:
-    """Cut images into cells, those that look alike once where that pays.
+    """Cut images [N, C, H, W] into cells, those that look alike once where that pays.
 
     It pays on a CPU, for bytes of which half or more repeat. Images whose sides are not multiples
     of the patch are padded with black to the right and below.
-
-    Args:
-        image: [N, C, H, W].
-        patch: pixels along one side of a cell.
 
     Returns:
         Cells, of the image's type, [U, C, patch * patch], and which lies where, int64 [N, h * w].
@@ -206,12 +202,8 @@ class Views(NamedTuple):
 def distinct_views(image: Tensor, layers: int) -> Views | None:
     """Find what strided convolutions of kernel 3 look at, layer by layer, as long as it repeats.
 
-    Args:
-        image: [N, C, H, W].
-        layers: how many convolutions, at least two.
-
-    Returns:
-        What the first of them look at; None where not even the windows of two repeat enough.
+    Returns None where not even the windows of two of the ``layers``, at least two, repeat enough
+    in an image [N, C, H, W].
     """
     windows = distinct_windows(image)
     if windows is None:

@@ -73,8 +73,6 @@ def load(
     """Read a network that :func:`save` wrote and build it again, with its words, on ``device``.
 
     Args:
-        path: the file.
-        device: where to build it.
         kind: the kind that is expected (``"policy"``, ``"inverse"``, ...); None allows any.
         checksum: what :func:`save` returned for it; None allows any.
 
@@ -121,7 +119,6 @@ def save_pretrained(
     """Write a network as a folder with a model card, and send it to the Hugging Face Hub if asked.
 
     Args:
-        module: what a ``make_*`` function built.
         folder: where to. In a folder that exists, the card and ``network.safetensors`` are
             replaced, never what symbolic links of these names point to. Everything else stays, and
             so does a ``README.md`` that is no card of this library.
@@ -130,8 +127,6 @@ def save_pretrained(
         hub_id: ``user/name`` on the Hub; needs the extra ``hub`` and an account that is logged in.
         hub: ``private``, ``token``, and options of ``huggingface_hub.HfApi.upload_folder`` such as
             ``commit_message``, ``revision`` or ``create_pr``.
-
-    Returns the folder.
 
     Raises:
         UserError: for a module that no ``make_*`` function built, words that do not fit it, a
@@ -169,7 +164,6 @@ def from_pretrained(
 
     Args:
         source: its folder, or ``user/name`` on the Hugging Face Hub (extra ``hub``).
-        device: where to build it.
         kind: the kind that is expected, such as ``"policy"``; None allows any.
         hub: for ``huggingface_hub.snapshot_download``, such as ``revision``, ``cache_dir``,
             ``token`` or ``local_files_only``.
@@ -267,13 +261,10 @@ def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
 
 
-def _hub() -> Any:
-    return optional("huggingface_hub", extra="hub")
-
-
 def _upload(folder: Path, hub_id: str, private: bool | None = None, **options: Any) -> None:
     """Send the files of a network in one commit; those of another that was there go with it."""
-    api = _hub().HfApi(token=options.pop("token", None))
+    hub = optional("huggingface_hub", extra="hub")
+    api = hub.HfApi(token=options.pop("token", None))
     try:
         repo = api.create_repo(hub_id, private=private, exist_ok=True)
         api.upload_folder(
@@ -293,7 +284,7 @@ def _upload(folder: Path, hub_id: str, private: bool | None = None, **options: A
 
 
 def _downloaded(hub_id: str, options: dict[str, Any]) -> Path:
-    hub = _hub()
+    hub = optional("huggingface_hub", extra="hub")
     try:
         return Path(hub.snapshot_download(hub_id, allow_patterns=FILES, **options))
     except (OSError, ValueError) as error:  # what all errors of the Hub are

@@ -31,8 +31,6 @@ class GRUInstructionEncoder(nn.Module):
     PyTorch's own, which are smaller, would make all sentences nearly the same.
 
     Args:
-        vocabulary_size: number of token ids.
-        embedding: size of a word's embedding.
         hidden: size of the state, each way.
         rate: how fast it learns, relative to the rest of a network: weights are kept divided by it.
         pooling: ``"mean"`` or ``"last"``: which states make the feature, of size 2 * hidden.
@@ -147,11 +145,7 @@ class GRUInstructionEncoder(nn.Module):
 
 
 def word_tree(tokens: Tensor, lengths: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
-    """Find what rows begin with, each beginning once: a tree of words.
-
-    Args:
-        tokens: ids, int64 [N, L].
-        lengths: how many of each row count, int64 [N].
+    """Find what rows of ids [N, L], ``lengths`` [N] of each, begin with, once: a tree of words.
 
     Returns:
         For each length the different beginnings, in order: their last word and which of those one
@@ -193,11 +187,7 @@ def sentence_lengths(tokens: Tensor) -> Tensor:
 
 
 def without_padding(tokens: Tensor, words: int) -> Tensor:
-    """Cut [N, L] behind the end of the longest of its instructions.
-
-    Raises:
-        UserError: where an id is none of so many words.
-    """
+    """Cut [N, L] behind the end of the longest instruction, or refuse ids of no word."""
     if not tokens.numel():
         return tokens
     lowest, highest = tokens.aminmax()

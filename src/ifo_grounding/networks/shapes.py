@@ -66,8 +66,6 @@ n_actions=6, tile_size=None)
             source: a :class:`Shapes`, a TorchRL env, or anything with the attributes
                 ``image_shape`` and ``vocabulary_size`` (a dataset). Attributes named as the fields
                 of this class win over an env's specs.
-            pixels: name of images in an env's spec.
-            instruction: name of instructions in an env's spec.
 
         Raises:
             UserError: where a size can be read from neither an attribute nor a spec, where actions

@@ -95,7 +95,6 @@ def attention_maps(policy: nn.Module, pixels: Tensor, instruction: Tensor) -> Te
     evidence against them, and of ``paper`` what all gates together let through.
 
     Args:
-        policy: built by ``make_policy``.
         pixels: uint8 [N, C, H, W].
         instruction: token ids, int64 [N, L].
 

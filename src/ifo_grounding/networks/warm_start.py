@@ -53,9 +53,6 @@ def _copy(
 
     Of ``widened`` the second may read several images, whose inputs lie one after the other: it
     reads the last one as the first module does, the others not yet.
-
-    Raises:
-        UserError: where the weights do not fit.
     """
     try:
         if source.config.preset != network.config.preset:

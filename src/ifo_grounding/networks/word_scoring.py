@@ -144,12 +144,9 @@ class WordScorer(PairScorer):
         return torch.cat(parts, -1)
 
     def _pointed(self, cells: Tensor, spoken: Tensor, index: Tensor) -> Tensor:
-        """Return the maps' logits of cells for instructions: [N, C, K, images * maps].
+        """Return the maps' logits of cells [N, F, C] for instructions: [N, C, K, images * maps].
 
-        Args:
-            cells: features of N scenes, [N, F, C].
-            spoken: how much each word counts for each map, of P instructions, [P, V * maps].
-            index: which of these each scene is read with, [N, K].
+        ``spoken`` is how much each word counts for each map, [P, V * maps]; ``index`` is [N, K].
         """
         maps = self.config.maps
         weights = spoken.unflatten(1, (self.known, maps)).transpose(1, 2)[index]  # [N, K, maps, V]

@@ -107,8 +107,7 @@ def flat(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
 def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = None) -> None:
     """Raise :class:`UserError` unless ``action`` has this shape and is one of ``count``, if given.
 
-    Where ``count`` actions are known, indices have to be of them. On a GPU, which would have to be
-    waited for, they are not checked.
+    On a GPU, which would have to be waited for, indices are not checked.
     """
     if tuple(action.shape) != tuple(expected):
         raise UserError(

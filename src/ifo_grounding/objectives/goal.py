@@ -29,10 +29,9 @@ class GoalLoss(SupervisedLoss):
     Args:
         network: first image, image and instruction to a logit, as ``make_goal_classifier`` builds.
         pool: token ids [P, L] of the instructions of the demonstrations.
-        removal_rate: share of a batch's negatives to remove, those scored highest; None estimates.
-        warmup: share of training before which none is removed.
-        near: share of the negatives that differ from the own instruction in few words.
-        negatives: how many other instructions each final frame is scored with.
+        negatives: how many other instructions each final frame is scored with. For
+            ``removal_rate``, ``warmup`` and ``near`` see
+            :class:`~ifo_grounding.objectives.NegativeInstructions`.
 
     >>> from ifo_grounding.networks import Shapes, make_goal_classifier
     >>> pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)

@@ -30,11 +30,9 @@ class InstructionLoss(SupervisedLoss):
     Args:
         network: an image and an instruction to a logit, as ``make_instruction_classifier`` builds.
         pool: token ids [P, L] of the instructions of the demonstrations.
-        removal_rate: share of a batch's negatives to remove, those scored highest; None estimates.
-        warmup: share of training before which none is removed.
-        near: share of the negatives that differ from the own instruction in few words.
         negatives: how many negatives each scene is scored with, at most as many as there are other
-            instructions; they share its image's encoding.
+            instructions; they share its image's encoding. For ``removal_rate``, ``warmup`` and
+            ``near`` see :class:`~ifo_grounding.objectives.NegativeInstructions`.
         contrast: weight of the cross entropy of finding a scene's own instruction among its
             negatives, in nats (InfoNCE, van den Oord et al. 2018): for large pools, where nearly
             all negatives name things that the scene lacks. An extension of the paper.

@@ -61,9 +61,8 @@ class MixtureEstimate(nn.Module):
     @torch.no_grad()
     def add(self, positive: Tensor, unlabelled: Tensor) -> None:
         """Remember scores, [N] and [M]; the oldest are forgotten."""
-        for kind, (memory, scores) in enumerate(
-            [(self.positive, positive), (self.unlabelled, unlabelled)]
-        ):
+        both = [(self.positive, positive), (self.unlabelled, unlabelled)]
+        for kind, (memory, scores) in enumerate(both):
             scores = scores.detach().flatten().to(memory.dtype)[-len(memory) :]
             places = torch.arange(len(scores), device=memory.device) + self.count[kind]
             memory[places % len(memory)] = scores

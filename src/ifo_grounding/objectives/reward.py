@@ -105,9 +105,7 @@ class RewardLoss(SupervisedLoss):
     def _scores(self, tensordict: TensorDictBase, actions: Tensor) -> Tensor:
         """Score several actions [*B, K] of each state: logits [*B, K]."""
         *input_keys, action_key = self.network.in_keys
-        check_action(
-            actions[..., 0], tuple(tensordict.get(input_keys[-1]).shape[:-1]), self.n_actions
-        )
+        check_action(actions[..., 0], tensordict.get(input_keys[-1]).shape[:-1], self.n_actions)
         actions = actions.long()
         if hasattr(self.network, "all_actions"):
             every = self.network.all_actions(*(tensordict.get(key) for key in input_keys))

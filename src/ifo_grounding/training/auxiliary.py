@@ -49,10 +49,8 @@ class AdversarialUpdates:
     Demonstrated actions are positives, the policy's own actions are negatives.
 
     Args:
-        loss: the reward model's loss.
-        demonstrations: labelled demonstrations.
+        demonstrations: labelled ones.
         steps: gradient steps after each iteration of self-examination.
-        lr: learning rate.
         batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
     """
 

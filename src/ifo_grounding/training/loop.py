@@ -12,6 +12,8 @@ from ifo_grounding.training.checkpoint import Checkpoint
 
 Metrics = dict[str, float]
 Log = Callable[[Metrics, int], None]
+SHOWN = ("loss", "accuracy", "learned_return")
+"""Beginnings of the names of metrics that a progress bar shows."""
 
 
 class Loop:
@@ -43,7 +45,9 @@ class Loop:
         with progress_bar(desc=self.name, shown=self.progress, **how) as bar:
             for iteration in range(first, end):
                 yield iteration
-                bar.set_postfix(_shown(self.history[-1]), refresh=False)
+                metrics = self.history[-1]
+                shown = [key for key in metrics if key.startswith(SHOWN)][:3]
+                bar.set_postfix({key: f"{metrics[key]:.3f}" for key in shown}, refresh=False)
                 bar.update()
 
     def add(self, metrics: Metrics, step: int) -> None:
@@ -66,9 +70,3 @@ class Loop:
         if self.saved and due:
             self.saved.save({"iteration": self.done, "history": self.history})
             self._last_save = time.monotonic()
-
-
-def _shown(metrics: Metrics) -> dict[str, str]:
-    """Return the metrics that a progress bar shows."""
-    shown = [key for key in metrics if key.startswith(("loss", "accuracy", "learned_return"))]
-    return {key: f"{metrics[key]:.3f}" for key in shown[:3]}

@@ -44,12 +44,9 @@ def select_pairs(
         env: simulator without instructions, with ``scene_numbers`` of its running episodes.
         classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
         pool: token ids of the instructions, int64 [N, L]; duplicates count once.
-        n: number of pairs.
         threshold: least probability of a suitable pair.
         candidates: instructions scored for each state; the whole pool if it is smaller.
         choose: ``random`` among the suitable ones, or the ``best``.
-        seed: seed of the choices.
-        progress: whether to show a progress bar.
 
     Returns:
         TensorDict [n] on the CPU: ``scene`` int64 [n, 1], ``instruction`` int64 [n, L], ``score``

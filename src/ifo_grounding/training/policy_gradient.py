@@ -56,7 +56,18 @@ class Learner:
             deactivate_vmap=True,  # networks compute what repeats once, in shapes that vmap lacks
             value_chunk_size=max(1, AT_ONCE // config.steps),
         )
-        self.loss = _make_loss(policy, value, config)
+        self.loss: LossModule
+        if config.algorithm == "ppo":
+            self.loss = ClipPPOLoss(
+                policy,
+                value,
+                clip_epsilon=config.clip,
+                entropy_bonus=config.entropy > 0,
+                entropy_coeff=config.entropy,
+                normalize_advantage=True,
+            )
+        else:
+            self.loss = ReinforceLoss(policy, value)
         worth = output_key(value, keys.STATE_VALUE)
         for part in (self.advantage, self.loss):
             part.set_keys(reward=keys.LEARNED_REWARD, value=worth)
@@ -89,20 +100,3 @@ class Learner:
                     losses["loss_imitation"] = self.imitation()
                 updates.append(update(losses, self.optimizer, config.grad_clip))
         return means(updates)
-
-
-def _make_loss(
-    policy: ProbabilisticTensorDictSequential,
-    value: TensorDictModuleBase,
-    config: SelfExaminationConfig,
-) -> LossModule:
-    if config.algorithm == "ppo":
-        return ClipPPOLoss(
-            policy,
-            value,
-            clip_epsilon=config.clip,
-            entropy_bonus=config.entropy > 0,
-            entropy_coeff=config.entropy,
-            normalize_advantage=True,
-        )
-    return ReinforceLoss(policy, value)

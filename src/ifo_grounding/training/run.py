@@ -73,7 +73,6 @@ class Run:
         self.logger = logger
 
     def __truediv__(self, name: str) -> Path:
-        """Return the path of something in the run's folder."""
         return self.folder / name
 
     @contextlib.contextmanager
@@ -195,7 +194,6 @@ class Run:
         A phase 2 can so be repeated with other options, from the same phase 1.
 
         Args:
-            other: the run to copy.
             without: names of stages and files that this run is to make anew.
 
         Raises:

@@ -66,7 +66,6 @@ class EarlyStopping(BestWeights):
     Args:
         loss: the LossModule that is trained; it is measured in eval mode.
         buffer: held-out samples, all of which are measured.
-        batch_size: samples measured together.
 
     Raises:
         UserError: where the buffer is empty.
@@ -112,7 +111,6 @@ class HeldOutAccuracy:
     Args:
         policy: acts greedily.
         buffer: held-out transitions, as :func:`~ifo_grounding.data.labelled_buffer` makes them.
-        batch_size: transitions that pass the policy together.
 
     Raises:
         UserError: where the buffer is empty.
@@ -174,7 +172,6 @@ class BestCheckpoint(BestWeights):
     Args:
         env: batched; its transforms choose instructions and pay learned rewards.
         policy: plays greedily.
-        seed: seed of the starts.
         episodes: how many are played for a measure.
         max_steps: most actions of an episode.
         margin: standard errors by which a policy has to be better to be kept.

@@ -109,26 +109,22 @@ def self_examine(
 ) -> list[Metrics]:
     """Improve ``policy`` in place by policy gradient on learned rewards.
 
+    Returns the metrics of each iteration.
+
     Args:
         env: batched, without true instructions and rewards; its transforms choose instructions
             and write ``("next", "learned_reward")``. They are seeded anew each iteration, but for
             those inside the workers of a ``SerialEnv`` or ``ParallelEnv``.
         policy: the phase-1 policy, a ``ProbabilisticActor``.
         value: estimates the learned return.
-        config: algorithm and budget.
         seed: all randomness is a function of it and of the iteration, which starts from a reset.
         adversarial: trains the reward model on, with the steps of each iteration.
-        imitation: imitates the demonstrations on.
         held_out: policies that are clearly less accurate there than phase 1 are not selected. With
             ``adversarial`` the most accurate policy is the best.
         checkpoint: file to continue from, to the same result, and to save to.
         checkpoint_seconds: least time between two checkpoints.
         log: gets the metrics of each iteration and its number.
         callback: gets the iteration, returns further metrics; the place for audits.
-        progress: whether to show a progress bar.
-
-    Returns:
-        Metrics of each iteration.
 
     Raises:
         UserError: where the env exposes its true state, or has no learned reward, where ``policy``

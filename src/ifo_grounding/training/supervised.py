@@ -109,7 +109,6 @@ def fit(
             metrics. Where it has ``set_progress``, it is told the share of steps done.
         buffer: ``sample(batch_size)`` gives the loss its input; ``len`` of it decides how much
             ``config.prior`` counts.
-        config: steps, batch size, learning rate.
         seed: all randomness is a function of it, of ``name`` and of the iteration.
         name: names the stream of randomness, and the progress bar.
         checkpoint: file to continue from, to the same result, and to save to; not with a buffer
@@ -118,15 +117,13 @@ def fit(
         log: gets the mean metrics of each iteration and the step.
         held_out: an :class:`~ifo_grounding.training.EarlyStopping` or a
             :class:`~ifo_grounding.training.BestCheckpoint`, whose best weights are kept in the end.
-        progress: whether to show a progress bar.
         until: steps after which to pause, rounded up to whole iterations; a later call with the
             same checkpoint goes on. None learns to the end.
         cudagraph: whether to capture the step as a CUDA graph on a GPU, where the loss is
             ``capturable``, weights do not decay and samples are drawn at random; for networks that
             compute the same whatever they see, as those of this library do.
 
-    Returns:
-        Mean metrics of each iteration, with ``step`` and ``samples_per_second``.
+    Returns mean metrics of each iteration, with ``step`` and ``samples_per_second``.
 
     Raises:
         UserError: where ``buffer`` cannot be sampled, the checkpoint is of something else, or the
@@ -166,7 +163,16 @@ def fit(
         torch.manual_seed(derive(seed, name, iteration))
         first = iteration * config.iteration
         steps = range(first, min(first + config.iteration, config.steps))
-        metrics = _iterate(loss, buffer, optimizer, config, steps, make_step)
+        updates: list[dict[str, Tensor]] = []
+        start = time.perf_counter()
+        for number in steps:
+            if callable(set_progress := getattr(loss, "set_progress", None)):
+                set_progress(number / config.steps)
+            set_rate(optimizer, config.lr * config.rate(number))
+            updates.append(make_step(beside(buffer.sample(config.batch_size), loss)))
+        found = means(updates)  # read once: a GPU is not waited for after each step
+        speed = len(steps) * config.batch_size / (time.perf_counter() - start)
+        metrics = {"step": float(steps.stop), **found, "samples_per_second": speed}
         done = iteration + 1
         if held_out:
             if done % config.validate_every == 0 or done == iterations:
@@ -175,23 +181,3 @@ def fit(
                 held_out.restore()
         loop.add(metrics, steps.stop)
     return loop.history
-
-
-def _iterate(
-    loss: nn.Module,
-    buffer: ReplayBuffer,
-    optimizer: torch.optim.Optimizer,
-    config: FitConfig,
-    steps: range,
-    make_step: Update,
-) -> Metrics:
-    updates: list[dict[str, Tensor]] = []
-    start = time.perf_counter()
-    for step in steps:
-        if callable(set_progress := getattr(loss, "set_progress", None)):
-            set_progress(step / config.steps)
-        set_rate(optimizer, config.lr * config.rate(step))
-        updates.append(make_step(beside(buffer.sample(config.batch_size), loss)))
-    found = means(updates)  # read once: a GPU is not waited for after each step
-    speed = len(steps) * config.batch_size / (time.perf_counter() - start)
-    return {"step": float(steps.stop), **found, "samples_per_second": speed}

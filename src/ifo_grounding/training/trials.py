@@ -28,10 +28,7 @@ class Trial:
     """One of several initial weights of a network, trained for some steps and on from there.
 
     Args:
-        number: which one it is.
         loss: loss of a network with these weights (see :func:`trial_seed`).
-        buffer: what it learns from.
-        config: how it learns.
         checkpoint: file of this trial (see :meth:`ifo_grounding.training.run.Stage.trial`).
         options: further options of :func:`~ifo_grounding.training.fit`, such as ``seed`` and
             ``held_out``.

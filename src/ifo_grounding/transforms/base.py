@@ -106,13 +106,8 @@ class InstructionTransform(EpisodeTransform):
                 f"there is a token id {largest}, but the environment's vocabulary has {size} ids: "
                 "encode instructions with its vocabulary"
             )
-        return Bounded(
-            0,
-            size - 1,
-            shape=(*like.shape, self.tokens.shape[1]),
-            dtype=torch.int64,
-            device=like.device,
-        )
+        shape = (*like.shape, self.tokens.shape[1])
+        return Bounded(0, size - 1, shape=shape, dtype=torch.int64, device=like.device)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declare the instruction, in an environment that suits and has none."""

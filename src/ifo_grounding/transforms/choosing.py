@@ -106,12 +106,8 @@ class PoolScorer:
         whole = not isinstance(states, Tensor)
         rows = max(1, len(index) if whole else AT_ONCE // max(1, index.shape[1]))
         with evaluating(self.classifier):
-            parts = [
-                self._candidates(
-                    states[begin : begin + rows], index[begin : begin + rows].to(device)
-                )
-                for begin in range(0, len(index), rows)
-            ]
+            some = [slice(begin, begin + rows) for begin in range(0, len(index), rows)]
+            parts = [self._candidates(states[part], index[part].to(device)) for part in some]
         return torch.cat(parts).to(index.device)
 
     def _candidates(self, states: Any, index: Tensor) -> Tensor:
@@ -199,8 +195,7 @@ class PoolScorer:
         return Choices(chosen, score.sigmoid())
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave the encodings behind: a copy makes its own."""
-        return {**self.__dict__, "_encodings": None, "_weights": []}
+        return {**self.__dict__, "_encodings": None, "_weights": []}  # a copy makes its own
 
 
 def check_options(threshold: float, candidates: int, choose: str) -> None:
@@ -214,9 +209,6 @@ def check_options(threshold: float, candidates: int, choose: str) -> None:
 def draw_candidates(
     states: int, pool_size: int, candidates: int, generator: torch.Generator | None
 ) -> Tensor:
-    """Draw distinct candidates for each state, in random order, int64 [states, K].
-
-    K is ``candidates``, or ``pool_size`` if that is smaller.
-    """
+    """Draw ``candidates``, or all, for each state, distinct, in random order: int64 [states, K]."""
     lots = torch.rand(states, pool_size, generator=generator)
     return lots.topk(min(candidates, pool_size), dim=1).indices

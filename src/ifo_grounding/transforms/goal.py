@@ -23,9 +23,8 @@ class GoalReward(RewardTransform):
     An extension of the paper. The goal classifier sees the first image of the episode, the image
     after the step, and the instruction; it assumes that demonstrations end in success. Steps before
     the stop are paid nothing, and so are episodes that are cut. The transform carries the first
-    image as ``initial_pixels``. The true reward stays where it is, and the classifier in its mode
-    (train or eval). Called on a tensordict, or appended to a replay buffer, the transform relabels
-    steps that were collected before.
+    image as ``initial_pixels``. The true reward, the classifier's mode and steps that were
+    collected before are treated as by :class:`~ifo_grounding.transforms.LearnedReward`.
 
     Args:
         goal_classifier: TensorDictModule to a logit from ``pixels``, the image after the step, and

@@ -24,8 +24,7 @@ class RewardTransform(EpisodeTransform):
     """A transform that writes what :meth:`pay` says a step is worth, by a learned model.
 
     Args:
-        model: TensorDictModule that writes a logit.
-        logit: name of the logit.
+        model: writes a logit of the name ``logit``.
         in_keys: entries of a step that are read, in the order of the model's own ``in_keys`` and of
             ``also``; by default those themselves.
         out_keys: key of the reward, below ``next``.

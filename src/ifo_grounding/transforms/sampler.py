@@ -40,9 +40,6 @@ class InstructionSampler(InstructionTransform):
         choose: ``random`` among the suitable ones (then only as many are scored as it takes to find
             one), or the ``best``.
         max_tries: states drawn for one row before giving up.
-        seed: seed of the choices.
-        in_keys: key of the image.
-        out_keys: key of the instruction.
 
     Raises:
         UserError: on an option or a pool of another form, on an environment that exposes its true

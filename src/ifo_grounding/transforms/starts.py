@@ -32,9 +32,6 @@ class StartingPairs(InstructionTransform):
     Args:
         pairs: TensorDict [N] with ``scene`` int64 [N, 1] and ``instruction`` int64 [N, L]. With
             ``frame_hash`` int64 [N, 1], every scene is checked to be the one that was stored.
-        seed: seed of the order.
-        in_keys: key of the image.
-        out_keys: key of the instruction in the environment.
 
     Raises:
         UserError: on pairs of another form; on an environment that exposes its true state, has an
@@ -118,7 +115,6 @@ class StartingPairs(InstructionTransform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        batch = tensordict_reset.batch_size
         if self.hashes is not None:
             pixels = rows_of(tensordict_reset, self.in_keys[0])
             rows = self.new_rows(tensordict, len(pixels)).to(pixels.device)
@@ -130,7 +126,7 @@ class StartingPairs(InstructionTransform):
                     "stored with: make the environment with the task, seed, stream, layout and "
                     "tile size that select_pairs was given"
                 )
-        instruction = self.tokens[self._current].reshape(*batch, -1)
+        instruction = self.tokens[self._current].reshape(*tensordict_reset.batch_size, -1)
         return tensordict_reset.set(self.out_keys[0], instruction)
 
     def check_env(self, env: EnvBase) -> None:
