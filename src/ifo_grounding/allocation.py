@@ -12,10 +12,9 @@ TRIM_THRESHOLD, MMAP_MAX = -1, -4
 def keep_freed_memory() -> None:
     """Let the C library keep the memory that is freed, to hand it out again.
 
-    It returns large blocks to the system otherwise, which gives them back page by page, each filled
-    with zeros: on a CPU, a tensor of megabytes costs more to get than to fill. Call it once, before
-    the work begins. The process then holds on to the most that it ever needed, and to more where
-    blocks of many sizes come and go: :func:`release_freed_memory` gives back what is free.
+    Otherwise a tensor of megabytes costs more to get from the system than to fill. Call it once,
+    before the work begins. The process then holds on to the most that it ever needed, and to more
+    where sizes differ: :func:`release_freed_memory` gives back what is free.
     """
     with contextlib.suppress(AttributeError, OSError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt

@@ -17,9 +17,7 @@ from typing import Any
 
 from ifo_grounding.errors import UserError, did_you_mean
 
-USAGE_ERROR = 2
-INTERRUPTED = 130
-CLOSED = 141
+USAGE_ERROR, INTERRUPTED, CLOSED = 2, 130, 141
 HELP = ("-h", "--help")
 COMMANDS = {
     "demo": ("two_phase", "train and compare both phases on one task, then write a report"),
@@ -34,8 +32,7 @@ COMMANDS = {
 def one_line_errors() -> Iterator[None]:
     """Turn a :class:`UserError` into ``error: ...`` on stderr and exit code 2, without a traceback.
 
-    So it does with what the system refuses: a file that cannot be written, a full disk. SIGTERM
-    interrupts as SIGINT does.
+    So it does with what the system refuses, such as a full disk. SIGTERM interrupts as SIGINT does.
     ``IFO_GROUNDING_TRACEBACK=1`` in the environment keeps the traceback.
     """
     with contextlib.suppress(ValueError):  # another thread than the main one
@@ -59,9 +56,8 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
     """Decorate the function of a recipe script, which takes the options.
 
     The options are composed from ``conf/config.yaml`` and ``name=value`` on the command line, and
-    checked; a recipe with a ``conf/<script name>.yaml`` has options of its own. What is wrong with
-    them, and a :class:`UserError` of the recipe itself, becomes one line on stderr and exit code 2.
-    Results that several jobs return are printed as one table of means over their seeds.
+    checked; a recipe with a ``conf/<script name>.yaml`` has options of its own. Mistakes are shown
+    as of :func:`one_line_errors`. Results of several jobs become one table of means over seeds.
     """
     script = Path(inspect.getfile(function)).resolve()
 
@@ -87,10 +83,7 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run ``ifo-grounding`` with ``arguments`` (default: those of the process).
-
-    A mistake prints one line on stderr and exits with code 2.
-    """
+    """Run ``ifo-grounding`` with ``arguments`` (default: those of the process)."""
     command, *rest = (list(sys.argv[1:] if arguments is None else arguments)) or ["--help"]
     with one_line_errors():
         asked = rest if command == "run" else [command]

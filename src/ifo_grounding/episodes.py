@@ -45,7 +45,7 @@ def play(
     max_steps: int,
     on_step: OnStep | None = None,
 ) -> Outcomes:
-    """Play every row's episode to its end, once.
+    """Play every row's episode to its end, once; return the outcomes of all N rows.
 
     The policy is asked for the rows still running only. What rows do after their episode is
     ignored; an episode that has not ended after ``max_steps`` counts as a failure.
@@ -58,10 +58,7 @@ def play(
         start: what its reset returned.
         mode: ``greedy`` or ``sampled``.
         max_steps: most actions per episode.
-        on_step: called after each step with the rows that took it and their transitions.
-
-    Returns:
-        Outcomes of all rows [N], N the number of rows of the env.
+        on_step: see :data:`OnStep`.
 
     Raises:
         UserError: where the policy writes no action, or none of the environment's.
@@ -128,7 +125,6 @@ def _actions(policy: Policy, env: EnvBase, state: TensorDictBase, active: Tensor
 
 
 def _check(chosen: Tensor | None, env: EnvBase, shape: torch.Size) -> None:
-    """Refuse actions that the environment cannot take."""
     if chosen is None:
         raise UserError(
             f"the policy writes no action: a policy writes its actions under {env.action_key!r}, "

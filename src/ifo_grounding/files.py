@@ -21,7 +21,6 @@ TAKEN = (errno.ENOTEMPTY, errno.EEXIST)
 WRITERS = 20
 """How often a folder is tried to be replaced that others replace, too."""
 
-
 LEFT = re.compile(r"\..+\.[0-9a-f]{8}\.(tmp|old)")
 """Names of what is being written, and of what it takes the place of."""
 

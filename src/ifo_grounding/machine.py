@@ -14,8 +14,6 @@ from ifo_grounding.errors import UserError
 MOST_THREADS = torch.get_num_threads()
 """Torch's own choice, which heeds ``OMP_NUM_THREADS`` and the affinity of the process."""
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
-FASTER = 0.9
-"""Several threads have to take at most this share of the time of one."""
 
 
 def machine_of(device: torch.device | str) -> str:
@@ -53,7 +51,7 @@ def fastest_threads() -> int:
             (batch @ batch).relu().mul(0.5)
         seconds[number].append(time.perf_counter() - begun)
     one, several = (sorted(seconds[number])[10] for number in (1, most))
-    return most if several < FASTER * one else 1
+    return most if several < 0.9 * one else 1  # by a tenth at least
 
 
 def check_device(device: torch.device | str) -> None:

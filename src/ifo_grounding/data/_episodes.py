@@ -30,13 +30,7 @@ Episode = tuple[Name, Frames, str] | tuple[Name, Frames, str, bool]
 
 
 class Reader:
-    """Checks episodes one after the other, and notes all of them but the frames.
-
-    Args:
-        close: whether to repeat the last frame of episodes that do not end with a repeated frame.
-        vocabulary: the words that instructions may use; any by default.
-        length: words that an instruction may have, without a vocabulary.
-    """
+    """Checks episodes as ``Demonstrations.from_episodes`` takes them; notes all but the frames."""
 
     def __init__(
         self,
@@ -52,11 +46,7 @@ class Reader:
         self._first: tuple[Name, list[int]] | None = None
 
     def pieces(self, episodes: Iterable[Episode]) -> Iterator[Tensor]:
-        """Yield frames of several episodes together, uint8 [F, C, H, W].
-
-        Raises:
-            UserError: naming the first episode that is not as it has to be.
-        """
+        """Yield frames of several episodes together, uint8 [F, C, H, W], or refuse one by name."""
         waiting: list[Tensor] = []
         for number, episode in enumerate(episodes):
             if not isinstance(episode, tuple | list) or len(episode) not in (3, 4):
@@ -94,8 +84,25 @@ class Reader:
         return sentence
 
     def _frames(self, name: Name, given: Frames, close: bool) -> Tensor:
-        frames = _checked(name, given)
+        if given is None:
+            raise UserError(f"episode {name!r} has no frames")
+        try:
+            given = given if isinstance(given, Tensor) else np.require(given, None, ["C", "W"])
+            frames = torch.as_tensor(given).cpu()
+        except (TypeError, ValueError, RuntimeError):
+            raise UserError(f"episode {name!r}: its frames are not arrays of one size") from None
+        if frames.dtype != torch.uint8 or frames.ndim != 4 or not frames.numel():
+            raise UserError(
+                f"episode {name!r} is {frames.dtype} {list(frames.shape)}: give uint8 "
+                "[T + 1, C, H, W] with at least one frame; C is 1 for grey, 3 for colours, 4 with "
+                "alpha; of floats in 0..1 np.round(255 * frames).astype(np.uint8)"
+            )
         shape = list(frames.shape[1:])
+        if channels_last(frames.shape):
+            raise UserError(
+                f"episode {name!r} has images {shape}, with the colours last: give "
+                "[T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"
+            )
         first, expected = self._first = self._first or (name, shape)
         if shape != expected:
             raise UserError(
@@ -119,33 +126,6 @@ def check_size(frames: int, size: int) -> None:
 def _kind(value: object) -> str:
     sized = f" of {len(value)}" if isinstance(value, tuple | list) else ""
     return f"a {type(value).__name__}{sized}"
-
-
-def _checked(name: Name, given: Frames) -> Tensor:
-    """Return frames as a tensor, where they are as they have to be, as far as can be seen."""
-    if given is None:
-        raise UserError(f"episode {name!r} has no frames")
-    try:
-        frames = (
-            given.cpu()
-            if isinstance(given, Tensor)
-            else torch.as_tensor(np.require(given, None, ["C", "W"]))
-        )
-    except (TypeError, ValueError, RuntimeError):
-        raise UserError(f"episode {name!r}: its frames are not arrays of one size") from None
-    shape = list(frames.shape)
-    if frames.dtype != torch.uint8 or frames.ndim != 4 or not frames.numel():
-        raise UserError(
-            f"episode {name!r} is {frames.dtype} {shape}: give uint8 [T + 1, C, H, W] with at "
-            "least one frame; C is 1 for grey, 3 for colours, 4 with alpha; of floats in 0..1 "
-            "np.round(255 * frames).astype(np.uint8)"
-        )
-    if channels_last(shape):
-        raise UserError(
-            f"episode {name!r} has images {shape[1:]}, with the colours last: give "
-            "[T + 1, C, H, W], such as frames.transpose(0, 3, 1, 2)"
-        )
-    return frames
 
 
 def open_table(path: Path, kind: str = "parquet", **options: Any) -> Any:

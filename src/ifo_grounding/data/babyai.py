@@ -31,7 +31,6 @@ BABYAI_ACTIONS = ("left", "right", "forward", "pickup", "drop", "toggle", "done"
 """MiniGrid's actions."""
 DONE = BABYAI_ACTIONS.index("done")
 """The action that does nothing: how a policy says that it is done."""
-MISSIONS = ("ends", "waits", "none")
 PATIENCE = 3
 """How many times as many episodes as asked for are played before the bot counts as unable."""
 
@@ -54,7 +53,7 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
     Raises:
         UserError: where minigrid is missing, or there is no such level.
     """
-    check_choice("mission", mission, MISSIONS)
+    check_choice("mission", mission, ("ends", "waits", "none"))
     name = level if level.endswith(("-v0", "-v1")) else f"BabyAI-{level}-v0"
     optional("minigrid", extra="babyai")  # registers the levels
     if name not in gymnasium.registry:
@@ -79,7 +78,6 @@ class _Room(gymnasium.Wrapper):
         self.observation_space = gymnasium.spaces.Dict({"image": image, "mission": words})
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in a new room."""
         self._earned = 0.0
         with redirect_stdout(StringIO()):
             seen, info = self.env.reset(**options)
@@ -153,11 +151,6 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
         processes: how many record side by side; with several, a script needs its
             ``if __name__ == "__main__":``.
         vocabulary: the words of the missions; by default those that occur.
-        progress: whether to show a bar.
-
-    Returns:
-        The demonstrations, closed; with ``keep_truth`` also a
-        :class:`~ifo_grounding.data.truth.Truth`.
 
     Raises:
         UserError: where minigrid is missing, there is no such level, or the bot fails too often.
@@ -196,14 +189,7 @@ def bot_outcomes(
     """Return whether BabyAI's bot fulfils its mission in each of the rooms of a stream, bool [N].
 
     The rooms are those that :func:`~ifo_grounding.envs.from_gymnasium` shows by their numbers, with
-    the same seed and stream.
-
-    Args:
-        level: of BabyAI, see :func:`babyai`.
-        episodes: number of rooms.
-        seed: of the stream.
-        stream: ``training``, ``validation`` or ``evaluation``.
-        processes: how many play side by side.
+    the same seed and stream; other arguments are those of :func:`record_babyai`.
 
     Raises:
         UserError: where minigrid is missing, there is no such level or stream, or nothing to play.

@@ -47,9 +47,7 @@ def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer
     recording that was cut shows no success.
 
     Args:
-        demos: demonstrations, of which those that are closed end in success (see
-            :meth:`~ifo_grounding.data.Demonstrations.close_episodes`); the buffer shares their
-            frames.
+        demos: demonstrations; the buffer shares their frames.
         options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``sampler``.
 
     Raises:
@@ -92,17 +90,9 @@ def frame_buffer(
 ) -> TensorDictReplayBuffer:
     """Put entries that name frames and episodes by number into a buffer that looks them up.
 
-    Args:
-        demos: demonstrations; the buffer shares their frames.
-        stored: entries [N, ...]: numbers of frames at ``frame_keys``, the number of the episode at
-            ``instruction``, and whatever else.
-        frame_keys: which entries are frames.
-        options: as of :func:`encoded_buffer`.
-
-    Raises:
-        UserError: where there is no demonstration, or no entry.
+    Entries are [N, ...]: numbers of frames at ``frame_keys``, the number of the episode at
+    ``instruction``, and whatever else. None at all is a :class:`UserError`.
     """
-    check_demonstrations(demos)
     if not len(stored[keys.INSTRUCTION]):
         raise UserError("there are no transitions: no episode has two frames")
     entries = TensorDict(stored, [len(stored[keys.INSTRUCTION])])

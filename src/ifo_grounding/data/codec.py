@@ -142,8 +142,7 @@ class FrameCodec:
 
         Args:
             tiles: pictures, all different, uint8 [N, C, T, T].
-            parts: tile numbers, integer [F, rows, columns] each. The list is emptied on the way, so
-                that numbers and codes are not both in memory.
+            parts: tile numbers, integer [F, rows, columns] each; the list is emptied on the way.
             generator: decides the new numbers.
 
         >>> tiles = torch.arange(3, dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 8, 8)
@@ -206,13 +205,9 @@ class FrameCodec:
         assert self.words is not None
         distinct, index = distinct_rows(rows)
         known = len(self._numbers)
-        numbers = torch.tensor(
-            [
-                self._numbers.setdefault(row.tobytes(), len(self._numbers))
-                for row in distinct.numpy()
-            ],
-            dtype=torch.int64,
-        )
+        tiles = (row.tobytes() for row in distinct.numpy())
+        found = [self._numbers.setdefault(tile, len(self._numbers)) for tile in tiles]
+        numbers = torch.tensor(found, dtype=torch.int64)
         if len(self._numbers) > known:
             new = distinct[numbers >= known].view(-1, *self.words.shape[1:])
             self.words = torch.cat([self.words, new])

@@ -45,11 +45,7 @@ class Lookup(Transform):
         self.register_buffer("table", table, persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Look up the entries of a sample, which is copied, without its tensors.
-
-        A full buffer hands out its own storage when all of it is asked for: writing there would
-        spoil it.
-        """
+        """Look up the entries of a copy of a sample: a full buffer may hand out its storage."""
         if self.table is None or tensordict.device in (None, self.table.device):
             return super().forward(tensordict.clone(recurse=False))
         return super().forward(tensordict.to(self.table.device))

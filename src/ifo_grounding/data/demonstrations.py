@@ -264,14 +264,8 @@ class Demonstrations:
         """
         lengths = self.lengths + ~self.closed
         codes = take(self.codes, row_numbers(self.starts, self.lengths, lengths))
-        return Demonstrations(
-            self.codec,
-            codes,
-            lengths,
-            self.tokens,
-            vocabulary=self.vocabulary,
-            vocabulary_size=self.vocabulary_size,
-        )
+        words: Any = {"vocabulary": self.vocabulary, "vocabulary_size": self.vocabulary_size}
+        return Demonstrations(self.codec, codes, lengths, self.tokens, **words)
 
     def frames(self, number: Tensor) -> Tensor:
         """Return frames by number [*B] (row of ``codes``), uint8 [*B, C, H, W]."""
@@ -319,12 +313,7 @@ class Demonstrations:
         arrays, facts = load_folder(folder, KIND, names, ("tiles",))
         with damaged(folder):
             codes, lengths, tokens = (arrays[name] for name in names)
-            words = facts["words"]
-            return cls(
-                FrameCodec(facts["image_shape"], arrays.get("tiles")),
-                codes,
-                lengths,
-                tokens,
-                vocabulary=None if words is None else Vocabulary(words, tokens.shape[-1]),
-                vocabulary_size=facts["vocabulary_size"],
-            )
+            codec = FrameCodec(facts["image_shape"], arrays.get("tiles"))
+            words, size = facts["words"], facts["vocabulary_size"]
+            vocabulary = None if words is None else Vocabulary(words, tokens.shape[-1])
+            return cls(codec, codes, lengths, tokens, vocabulary=vocabulary, vocabulary_size=size)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     import datasets
 
 FRAMES, INSTRUCTION = "frames", "instruction"
-ROWS_IN_MEMORY = 16
 
 
 def from_huggingface(
@@ -45,7 +44,6 @@ def from_huggingface(
             machine are opened.
         frames: name of the column of frames.
         instruction: name of the column of instructions.
-        progress: whether to show a bar.
         options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
             ``tile_size``, ``close``.
 
@@ -73,11 +71,9 @@ def _selected(dataset: Any, frames: str, instruction: str) -> Iterable[Mapping[s
         raise UserError(f"choose one of the splits: dataset[...] with {splits}")
     if not hasattr(dataset, "select_columns"):
         return dataset
-    columns = [frames, instruction, TRUNCATED]
+    further = {TRUNCATED} & {*(dataset.column_names or ())}
     try:
-        selected = dataset.select_columns(
-            columns[: 2 + (TRUNCATED in (dataset.column_names or ()))]
-        )
+        selected = dataset.select_columns([frames, instruction, *further])
     except ValueError as error:
         raise UserError(f"{error}: name them with frames=... and instruction=...") from None
     feature: Any = (dataset.features or {}).get(frames)
@@ -175,5 +171,5 @@ def to_huggingface(
         cache_dir=None if cache_dir is None else str(cache_dir),
         # Without a name of its own, the dataset would be named by a hash of the pickled pixels.
         fingerprint=uuid.uuid4().hex,
-        writer_batch_size=ROWS_IN_MEMORY,
+        writer_batch_size=16,
     )

@@ -23,8 +23,6 @@ from ifo_grounding.modules import device_of, evaluating
 from ifo_grounding.progress import progress_bar
 
 KIND = "ifo-grounding labels"
-RELEASE_EVERY = 16
-"""Batches after which freed memory is given back: theirs differ in size and would pile up."""
 QUANTILES = {"min": 0.0, "p01": 0.01, "p10": 0.1, "median": 0.5}
 
 
@@ -100,12 +98,10 @@ def label_demonstrations(
     with the same result: no picture is put together.
 
     Args:
-        demos: what is labelled.
         inverse: reads ``pixels`` and ``("next", "pixels")``, or two images of other names: the one
             below ``next``, else the second, is the later one. Logits [B, A] are its first output.
         batch_size: transitions at once.
         device: where to run; by default where the model is.
-        progress: whether to show a bar.
         buffer_options: for :func:`labelled_buffer`.
 
     Raises:
@@ -128,7 +124,7 @@ def label_demonstrations(
             labels.append(best.indices.to("cpu", torch.uint8 if n_actions <= 256 else torch.int32))
             sure.append(best.values.cpu())
             bar.update(len(numbers))
-            if not count % RELEASE_EVERY:
+            if not count % 16:  # freed blocks differ in size and would pile up
                 release_freed_memory()
     report = LabelReport(torch.cat(labels), torch.cat(sure), n_actions)
     return Labelled(labelled_buffer(demos, report.actions, **buffer_options), report)
@@ -149,7 +145,6 @@ def labelled_buffer(
     true for the last transition of a demonstration. A transition takes 17 to 25 bytes.
 
     Args:
-        demos: demonstrations.
         actions: label of each transition, integer [M].
         next_pixels: whether samples also hold ``("next", "pixels")``.
         initial_pixels: whether samples also hold ``initial_pixels``, the episode's first frame.

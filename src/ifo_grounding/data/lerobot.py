@@ -40,11 +40,9 @@ def load_lerobot(
     Actions and states are never read. It needs the extra ``datasets``, and ``video`` for videos.
 
     Args:
-        folder: where from.
         camera: name of the camera, where there are several.
         stride: of so many frames one is taken, counted back from the last one.
         size: height and width that frames are scaled to; by default they stay as they are.
-        progress: whether to show a bar.
         options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
             ``tile_size``, ``close``.
 
@@ -161,17 +159,12 @@ def save_lerobot(demos: Demonstrations, folder: str | Path) -> None:
             write(f"data/{name}", said | {CAMERA: shown})
         write("meta/episodes/chunk-000/file-000", episodes | {TRUNCATED: demos.cut})
         write("meta/tasks", {"task_index": range(len(tasks))}, tasks)
-        features: dict[str, Any] = {
-            name: {"dtype": "int64", "shape": [1], "names": None} for name in said
-        }
+        single: Any = {"shape": [1], "names": None}
+        features: Any = {name: {"dtype": "int64", **single} for name in said}
         features["timestamp"]["dtype"] = "float32"
         names, shape = ["height", "width", "channels"], [*demos.image_shape[1:], 3]
         features[CAMERA] = {"dtype": "image", "shape": shape, "names": names}
-        info: dict[str, Any] = {
-            "codebase_version": VERSION,
-            "robot_type": None,
-            "fps": FRAMES_PER_SECOND,
-        }
+        info: Any = {"codebase_version": VERSION, "robot_type": None, "fps": FRAMES_PER_SECOND}
         info |= {"total_episodes": len(demos), "total_frames": demos.n_frames}
         info |= {"total_tasks": len(tasks), "splits": {"train": f"0:{len(demos)}"}}
         info |= {"chunks_size": 1000, "data_path": f"data/{FILE}.parquet", "video_path": None}

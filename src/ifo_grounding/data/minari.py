@@ -30,7 +30,6 @@ IMAGE, INSTRUCTION = "image", "mission"
 OBSERVED = "observations"
 ENDS = ("truncations", "terminations")
 """Names of what says how an episode ended."""
-ABSENT = "actions_absent"
 DESCRIPTION = (
     "Observation-only demonstrations: actions and rewards are absent. The format demands them, so "
     "both are 0 throughout and mean nothing."
@@ -59,7 +58,6 @@ def from_minari(
         image: name of the image in the observation; None where the observation is the image.
         instruction: name of the sentence in the observation, where it is the same throughout an
             episode, or else in the metadata of the episode or of the dataset.
-        progress: whether to show a bar.
         options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
             ``tile_size``, ``close``.
 
@@ -135,10 +133,7 @@ def _text(value: Any) -> str:
 
 
 def _decoded(rows: Any, space: spaces.Box, jpeg: bool) -> np.ndarray:
-    """Return images as they were before they were stored, in the order [T + 1, C, H, W].
-
-    Orders are told apart as ``from_gymnasium`` does; what is no image stays as it is.
-    """
+    """Return images as before storing, [T + 1, C, H, W]; what is no image stays as it is."""
     from minari.dataset.minari_storage import is_image_space
 
     if jpeg and is_image_space(space):
@@ -264,7 +259,7 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
                     folder.rename(unfinished)
             storage = MinariStorage.read(unfinished / "data")
             storage.update_episodes(buffers())
-            storage.update_metadata({ABSENT: True})
+            storage.update_metadata({"actions_absent": True})
     except (ValueError, AssertionError) as error:  # a detail that Minari does not take, for one
         raise UserError(f"{dataset_id!r} cannot be written: {error}") from None
     return minari.load_dataset(dataset_id)

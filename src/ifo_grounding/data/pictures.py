@@ -28,7 +28,6 @@ TRUNCATED = "truncated"
 VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 READ = (".gif", *VIDEOS, *SUFFIXES)
 """Suffixes of files that hold all frames of an episode."""
-KINDS = ("png", "mp4")
 COLOURS = (1, 3)
 FRAMES_PER_SECOND = 4
 
@@ -50,19 +49,15 @@ def load_pictures(
     recording that was cut, whose last frame is no stop.
 
     Frames that are numbered have to be numbered evenly: a missing one is an error. Each picture of
-    a GIF is one frame, however long it lasts. The pixels of one episode are in memory at a time.
-    A video is lossy: a repeated last frame may come back a little different.
+    a GIF is one frame, however long it lasts. Of a lossy video, a repeated last frame may differ.
 
     Args:
-        folder: where from.
         channels: 1 reads pictures as grey, 3 in colours, 4 with alpha.
-        progress: whether to show a bar.
         options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
             ``tile_size``, ``close``.
 
     Raises:
-        UserError: naming the episode, where a line, a frame or an instruction is not as it has to
-            be.
+        UserError: naming the episode whose line, frame or instruction is not as it has to be.
     """
     check_choice("channels", channels, MODES)
 
@@ -201,7 +196,7 @@ def save_pictures(
         UserError: where the folder holds something, there is no demonstration or no vocabulary, the
             kind is unknown, or images do not fit it.
     """
-    check_choice("kind", kind, KINDS)
+    check_choice("kind", kind, ("png", "mp4"))
     scale = at_least_one("scale", scale)
     sentences = written_sentences(demos, tuple(MODES) if kind == "png" else COLOURS)
     digits = len(str(len(demos) - 1))

@@ -51,12 +51,8 @@ def record_demonstrations(
         keep_truth: whether to return the actions too, for evaluation only.
         seed: same seed, same demonstrations.
         tile_size: pixels along one side of a cell: 8, 16 or 32.
-        progress: whether to show a bar.
         scenes: for :class:`~ifo_grounding.tasks.scenes.SceneOptions`: ``split``, ``holdout``,
             ``holdout_visible``, ``stream``, ``layout``, ``max_steps``.
-
-    Returns:
-        The demonstrations; with ``keep_truth`` also a :class:`~ifo_grounding.data.truth.Truth`.
 
     Raises:
         UserError: on an unknown name or an impossible size.
@@ -97,9 +93,7 @@ def record_demonstrations(
 def _demonstrate(scenes: Scene, ties: torch.Generator) -> tuple[Tensor, Tensor]:
     """Follow the instructions of all scenes side by side.
 
-    Returns:
-        Tile numbers of the frames of all episodes in a row, int16 [F, rows, columns], and the
-        actions of all episodes in a row, uint8 [F - episodes].
+    Return tile numbers, int16 [F, rows, columns], and actions, uint8 [F - episodes], in a row.
     """
     steps = scenes.wanted.steps
     frame_ends, action_ends = (steps + 1).cumsum(0), steps.cumsum(0)

@@ -29,7 +29,6 @@ from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
 BATCH_FRAMES = 2048
-READ_KEYS = (keys.PIXELS, keys.ACTION, (keys.NEXT, keys.PIXELS))
 
 
 class RandomActions(TensorDictModuleBase):
@@ -124,10 +123,7 @@ class Collected(NamedTuple):
 
     @classmethod
     def load(cls, folder: str | Path, **options: Any) -> Collected:
-        """Read what :meth:`save` wrote; a damaged or foreign folder is a :class:`UserError`.
-
-        Options are as of :func:`collect_transitions`.
-        """
+        """Read what :meth:`save` wrote, or raise :class:`UserError`; options are the buffer's."""
         names = ("pixels", "next_pixels", "action", "taken", "kept")
         arrays, facts = load_folder(folder, KIND, names, ("tiles",))
         codes, after, action, taken, kept = (arrays[name] for name in names)
@@ -169,16 +165,12 @@ def collect_transitions(
         stop_action: by default that of the environment; none where that is None.
         drop_unchanged: whether to leave out unchanged transitions other than stops.
         seed: of the actions; scenes are drawn by the environment.
-        progress: whether to show a bar.
         options: for ``TensorDictReplayBuffer``, such as ``batch_size``, ``sampler``, ``generator``;
             a ``transform`` comes after frames are decoded.
 
     Raises:
         UserError: where nobody says which action is the stop, and unchanged frames are to be left
             out; where no step showed anything; where a ``storage`` is given.
-
-    Returns:
-        The buffer, which stores codes and decodes them when sampled, and counts per action.
 
     >>> from ifo_grounding.envs import PickAndPlaceEnv
     >>> buffer, report = collect_transitions(PickAndPlaceEnv("pick", num_envs=8, seed=0), 64)
@@ -251,7 +243,8 @@ def _collect(
             for number, batch in enumerate(collector):
                 if not number:
                     _compare_workers(env, batch[keys.PIXELS][..., 0, :, :, :])
-                yield batch.select(*READ_KEYS).reshape(-1)[:remaining]
+                read = batch.select(keys.PIXELS, keys.ACTION, (keys.NEXT, keys.PIXELS))
+                yield read.reshape(-1)[:remaining]
                 bar.update(min(frames, remaining))
                 remaining -= min(frames, remaining)
                 if not remaining:

@@ -183,7 +183,6 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         }
 
     def _frames(self) -> np.ndarray:
-        """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
         if not self._simulator.started:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         return self._simulator.frames()

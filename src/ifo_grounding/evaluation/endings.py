@@ -41,13 +41,7 @@ class Endings(Described):
 
 
 def episode_endings(policy: Policy, task: str, *, episodes: int = 2000, **options: Any) -> Endings:
-    """Play the scenes of :func:`success_rate` and say how each episode ended.
-
-    Args:
-        policy: writes an action.
-        task: name of the task.
-        episodes: number of scenes.
-        options: of :func:`success_rate`, such as ``mode``, ``seed``, ``stream`` and ``split``.
+    """Play the scenes of :func:`success_rate`, with its options, and say how each episode ended.
 
     >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
     >>> episode_endings(stop, "pick", episodes=50).counts["nothing done"]

@@ -177,9 +177,5 @@ def return_audit(
     (returns, success), _ = play_scenes(
         policy, env_or_task, numbers, play_batch, mode=mode, purpose="return", **options
     )
-    return ReturnAudit(
-        auc=auc(returns, success),
-        success=wilson(int(success.sum()), len(success)),
-        returns=returns,
-        outcomes=success,
-    )
+    rate = wilson(int(success.sum()), len(success))
+    return ReturnAudit(auc(returns, success), success=rate, returns=returns, outcomes=success)

@@ -109,10 +109,6 @@ def success_rate(
 def compare_success(before: SuccessResult, after: SuccessResult) -> Difference:
     """Return the paired difference of two results on the same scenes.
 
-    Args:
-        before: result of the first policy.
-        after: result of the second.
-
     Raises:
         UserError: where the scenes or the modes differ.
     """

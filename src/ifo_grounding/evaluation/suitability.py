@@ -24,10 +24,6 @@ from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.transforms.choosing import PoolScorer
 from ifo_grounding.world import WorldState, render
 
-NOT_SERVED = -1
-SERVABLE_STATES = 500
-"""States for which the oracle goes through the whole pool."""
-
 
 @dataclass(frozen=True)
 class SuitabilityResult(Described):
@@ -39,8 +35,7 @@ class SuitabilityResult(Described):
     """Share of states for which any instruction was chosen."""
     servable: Rate
     """Share of states that some instruction of the pool suits, over the first 500 at most: no
-    module can rightly serve more. (With all instructions in the pool it is
-    about 61% for ``pick``, 53% for ``pick-out``.)"""
+    module can rightly serve more."""
     errors: dict[str, int]
     """Chosen instructions by what is wrong with them."""
     entropy: float
@@ -134,7 +129,7 @@ def suitable_rate(
         pixels = render(state, tile_size)
         chosen, score = scorer.choose(pixels, generator=draw, **how)
         reason = verdict(state, goals[chosen.clamp_min(0)], max_steps)
-        reason = reason.where(chosen >= 0, NOT_SERVED)
+        reason = reason.where(chosen >= 0, -1)
         found.append([part.cpu() for part in (state, chosen, score, reason)])
         if pairs_per_state:
             index = torch.randint(len(goals), (len(pixels), pairs_per_state), generator=draw)
@@ -151,7 +146,7 @@ def suitable_rate(
     return SuitabilityResult(
         rate=wilson(counts[0], sum(counts)),
         served=wilson(sum(counts), states),
-        servable=_servable(state[:SERVABLE_STATES].to(device), goals, goal_numbers, max_steps),
+        servable=_servable(state[:500].to(device), goals, goal_numbers, max_steps),
         errors=dict(zip(REASONS[1:], counts[1:], strict=True)),
         entropy=_entropy_bits(goal_numbers[chosen[chosen >= 0]]),
         most_entropy=_entropy_bits(goal_numbers.unique()),

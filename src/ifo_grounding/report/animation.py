@@ -13,11 +13,6 @@ from ifo_grounding.evaluation.recording import Episode
 from ifo_grounding.report.drawing import Captioned, draw_sheet
 from ifo_grounding.report.theme import BAD, GOOD, RUNNING
 
-COLOURS = 128
-"""Colours of an animation; the world has a few dozen."""
-HOLD = 2.5
-"""Seconds for which the end is shown."""
-
 
 def animation(
     episodes: Sequence[Episode],
@@ -56,15 +51,9 @@ def animation(
     if len(actions) < count:
         raise UserError(f"there are {count} actions and {len(actions)} names: name all of them")
     titled = list(zip(episodes, titles or [""] * len(episodes), strict=True))
-    pictures = [
-        draw_sheet(
-            [_cell(episode, title, step, actions) for episode, title in titled],
-            columns=columns,
-            width=width,
-        )
-        for step in range(max(len(episode.frames) for episode in episodes))
-    ]
-    return gif(pictures, fps=4)
+    steps = range(max(len(episode.frames) for episode in episodes))
+    cells = ([_cell(episode, title, step, actions) for episode, title in titled] for step in steps)
+    return gif([draw_sheet(each, columns=columns, width=width) for each in cells], fps=4)
 
 
 def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Captioned:
@@ -79,14 +68,14 @@ def _cell(episode: Episode, title: str, step: int, actions: Sequence[str]) -> Ca
 
 
 def gif(pictures: Sequence[Image.Image], fps: float) -> bytes:
-    """Return pictures of one size as a GIF that repeats, the last one held for a while."""
+    """Return pictures of one size as a GIF that repeats, the last one held for 2.5 s."""
     # One palette, from the first and the last picture, keeps colours from flickering.
     both = Image.new("RGB", (pictures[0].width, 2 * pictures[0].height))
     both.paste(pictures[0], (0, 0))
     both.paste(pictures[-1], (0, pictures[0].height))
-    palette = both.quantize(COLOURS, dither=Image.Dither.NONE)
+    palette = both.quantize(128, dither=Image.Dither.NONE)
     frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    durations = [round(1000 / fps)] * (len(frames) - 1) + [round(1000 * HOLD)]
+    durations = [round(1000 / fps)] * (len(frames) - 1) + [2500]
     buffer = io.BytesIO()
     frames[0].save(
         buffer,

@@ -16,11 +16,6 @@ from ifo_grounding.tasks.goals import REASONS
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import render
 
-PICTURE_TILE_SIZE = 32
-"""Pixels along one side of a cell in the pictures of cases."""
-SEARCHED = 512
-"""States among which to look for cases."""
-
 
 def instruction_cases(
     classifier: TensorDictModuleBase,
@@ -41,14 +36,14 @@ def instruction_cases(
         count: how many cases at most.
         options: of :func:`~ifo_grounding.evaluation.suitable_rate`, such as ``threshold``.
     """
-    found = suitable_rate(classifier, task, pool, states=SEARCHED, pairs_per_state=0, **options)
+    found = suitable_rate(classifier, task, pool, states=512, pairs_per_state=0, **options)
     tokens, _ = read_pool(task, pool)
     wrong = (found.verdict > 0).nonzero().squeeze(-1).tolist()[: count // 3]
     right = (found.verdict == 0).nonzero().squeeze(-1).tolist()[: count - len(wrong)]
     rows = torch.tensor([*right, *wrong], dtype=torch.int64)
     if not len(rows):
         return []
-    pictures = render(found.state[rows], PICTURE_TILE_SIZE).numpy()
+    pictures = render(found.state[rows], tile_size=32).numpy()
     sentences = VOCABULARY.decode(tokens[found.chosen[rows]])
     cases = []
     for row, picture, sentence in zip(rows.tolist(), pictures, sentences, strict=True):

@@ -70,12 +70,8 @@ def write_report(
         file = "-".join([f"{number:02}", *re.findall("[a-z0-9]+", name.lower())])[:80]
         sections.append({"name": name, **_picture(picture, folder / "pictures" / file)})
     # Every text is escaped by the template: instructions and names come from users.
-    pages = Environment(
-        loader=PackageLoader("ifo_grounding.report", ""),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    loader = PackageLoader("ifo_grounding.report", "")
+    pages = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     page = pages.get_template("page.html").render(
         title=title, summary=summary, cards=cards, sections=sections
     )

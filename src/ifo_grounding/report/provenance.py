@@ -36,7 +36,6 @@ def provenance() -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    """Return the commit, with a plus where files other than results changed since."""
     root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists():
         return None

@@ -45,8 +45,7 @@ def results_rows(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return one row per measurement of a run, in the order of the pipeline.
 
     Args:
-        results: what the recipe ``evaluate`` measured, as plain values; what is missing is left
-            out.
+        results: plain values that the recipe ``evaluate`` measured; missing ones are left out.
 
     >>> from ifo_grounding.stats import wilson
     >>> results_rows({"suitability": {"served": wilson(9, 10).as_dict()}})[0]["measured"]
@@ -129,9 +128,7 @@ def restored(kind: type[Measured], values: Mapping[str, Any]) -> Measured:
     >>> print(restored(Rate, {"rate": None, "low": 0.0, "high": 1.0, "successes": 0, "count": 0}))
     undefined (n=0)
     """
-    known: dict[str, Any] = {
-        key: math.nan if value is None else value for key, value in values.items()
-    }
+    known: Any = {key: math.nan if value is None else value for key, value in values.items()}
     return kind(**known)
 
 

@@ -29,19 +29,12 @@ from ifo_grounding.report.theme import (
     without_formulas,
 )
 
-MAPS = 8
-"""Maps that are shown: the sharpest ones."""
-STEPS = 30
-"""Steps that are shown at most: the last ones."""
-SENTENCE_WIDTH = 70
-"""Letters of the instruction on one line."""
-
 
 def trace_animation(trace: Trace, *, actions: Sequence[str] = keys.ACTIONS) -> bytes:
-    """Return a GIF of an episode, step by step.
+    """Return a GIF of the last 30 steps of an episode.
 
     Each picture has what the policy sees, the instruction, the probability of each action, the
-    learned rewards so far, and the cells that the sharpest attention maps weigh.
+    learned rewards so far, and the cells that the eight sharpest attention maps weigh.
 
     Args:
         trace: from :func:`~ifo_grounding.evaluation.trace_episode`.
@@ -53,9 +46,9 @@ def trace_animation(trace: Trace, *, actions: Sequence[str] = keys.ACTIONS) -> b
     count = trace.probabilities.shape[-1]
     if len(actions) != count:
         raise UserError(f"there are {count} actions and {len(actions)} names: name each of them")
-    board = _Board(trace, sharpest(trace.maps, MAPS), actions)
+    board = _Board(trace, sharpest(trace.maps, 8), actions)
     end = len(trace.maps)
-    return gif([board.picture(step) for step in range(max(0, end - STEPS), end)], fps=1.5)
+    return gif([board.picture(step) for step in range(max(0, end - 30), end)], fps=1.5)
 
 
 def sharpest(maps: np.ndarray, count: int) -> np.ndarray:
@@ -77,7 +70,7 @@ class _Board:
         self.trace, self.chosen, self.names = trace, maps, actions
         self.figure, _ = new_panels(1, 7.2, 5.2)
         self.figure.clear()
-        sentence = textwrap.fill(trace.episode.sentence, SENTENCE_WIDTH)
+        sentence = textwrap.fill(trace.episode.sentence, 70)
         self.figure.suptitle(sentence, fontsize=12, fontweight="bold", color=INK)
         rows = self.figure.add_gridspec(2, 1, height_ratios=(3, 1.15))
         top = rows[0].subgridspec(1, 3 if trace.rewards else 2)

@@ -14,10 +14,6 @@ from ifo_grounding.stats.results import CONFIDENCE, Difference, Rate
 RESAMPLES = 4000
 """Bootstrap replicates: bounds are stable to about a tenth of a width."""
 TAIL = (1 - CONFIDENCE) / 2
-FEW_CHANGES = 10
-"""Scenes that changed, below which a bootstrap of differences is not trusted alone."""
-BINS = 10
-"""Of a reliability diagram."""
 
 
 def wilson(successes: int, count: int) -> Rate:
@@ -56,7 +52,7 @@ def reliability(probabilities: ArrayLike, happened: ArrayLike) -> list[tuple[flo
     true = np.asarray(happened, dtype=bool).ravel()
     if len(said) != len(true) or not ((said >= 0) & (said <= 1)).all():
         raise UserError("reliability needs probabilities within 0..1, and as many outcomes")
-    places = np.minimum((said * BINS).astype(int), BINS - 1)
+    places = np.minimum((said * 10).astype(int), 9)
     return [
         (float(said[here].mean()), wilson(int(true[here].sum()), int(here.sum())))
         for here in (places == place for place in np.unique(places))
@@ -66,8 +62,7 @@ def reliability(probabilities: ArrayLike, happened: ArrayLike) -> list[tuple[flo
 def _bootstrap_bounds(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a percentile interval of the mean of [seeds, scenes]: seeds are drawn, then scenes.
 
-    Scenes in which every seed came out alike are drawn by their number, which is the same as one by
-    one and takes hardly longer for many scenes than for few.
+    Scenes in which every seed came out alike are drawn by their number, the same as one by one.
     """
     seeds, scenes = values.shape
     rng = np.random.default_rng(0)
@@ -90,8 +85,7 @@ def two_level_bootstrap(outcomes: ArrayLike) -> Rate:
 
     Each replicate draws seeds with replacement, then scenes, the same for every seed. The interval
     is a percentile interval, widened to hold Wilson's of the pooled outcomes, so that it is never
-    empty; where all outcomes are the same, Wilson's of the scenes. With few seeds it is too narrow,
-    as every bootstrap is: it knows of no spread but theirs.
+    empty; where all are the same, Wilson's of the scenes. With few seeds it is too narrow.
 
     Args:
         outcomes: successes, bool [seeds, scenes], column j the same scene for every seed; [scenes]
@@ -171,9 +165,7 @@ def _exact_bounds(better: int, worse: int, seeds: int, scenes: int) -> list[floa
     That is where fewer than ten changed, or all but fewer than ten were won, or lost.
     """
     up, down, size = better / seeds, worse / seeds, seeds * scenes
-    few, won, lost = (
-        others < FEW_CHANGES for others in (better + worse, size - better, size - worse)
-    )
+    few, won, lost = (others < 10 for others in (better + worse, size - better, size - worse))
     bounds = []
     if few or won:
         bounds.append(_exact_upper(up, scenes) - down / scenes)
@@ -187,10 +179,7 @@ def _exact_bounds(better: int, worse: int, seeds: int, scenes: int) -> list[floa
 
 
 def _exact_upper(count: float, of: int) -> float:
-    """Return the upper bound of Clopper and Pearson's interval of a share.
-
-    The count is a mean over seeds, which need not be whole as SciPy's ``binomtest`` has it.
-    """
+    """Return Clopper and Pearson's upper bound of a share; the count, a mean, may be no whole."""
     return 1.0 if count >= of else float(beta.ppf(1 - TAIL, count + 1, of - count))
 
 

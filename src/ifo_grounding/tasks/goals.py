@@ -125,14 +125,11 @@ def plan(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Plan:
 
 
 def verdict(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Tensor:
-    """Say whether a goal suits an initial state and, if not, why: index into :data:`REASONS`.
+    """Say whether a goal suits an initial state: index into :data:`REASONS`, int64 [*B].
 
     A goal is suitable if all it mentions exists without ambiguity, its destination is on the grid
     and free, it is not true yet, and it can be reached within ``max_steps`` (paper, "Selected
     Instructions Suitability").
-
-    Returns:
-        int64 [*B]; 0 is suitable.
     """
     return plan(state, goal, max_steps).verdict
 

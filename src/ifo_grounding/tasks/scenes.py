@@ -136,7 +136,13 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
         places.append(left[has])
         left, tried, drawn = left[~has], tried + times, drawn + len(lots)
     every: Any = torch.cat(found)
-    return _said(every[torch.cat(places).argsort()], options)
+    every = every[torch.cat(places).argsort()]
+    if options.instructed:
+        wanted, said = every.wanted, grammar(options.task).encode(every.goal, every.wording)
+    else:
+        wanted = torch.zeros_like(every.wanted)
+        said = every.wording.new_zeros(len(every), VOCABULARY.length)
+    return Scene(every.state, wanted, said, batch_size=every.batch_size)
 
 
 def _propose(options: SceneOptions, lots: Lots) -> tuple[_Proposal, Tensor]:
@@ -149,17 +155,6 @@ def _propose(options: SceneOptions, lots: Lots) -> tuple[_Proposal, Tensor]:
         good = torch.ones_like(good)
     wording = lots.below(len(grammar(options.task).phrasings)).squeeze(-1)
     return _Proposal(state, wanted, goal, wording, batch_size=[len(lots)]), good
-
-
-def _said(found: _Proposal, options: SceneOptions) -> Scene:
-    """Return scenes with a sentence for each goal, or with a plan and words of zeros."""
-    wanted: Any = found.wanted
-    if options.instructed:
-        said = grammar(options.task).encode(found.goal, found.wording)
-    else:
-        wanted = torch.zeros_like(wanted)
-        said = found.wording.new_zeros(len(found), VOCABULARY.length)
-    return Scene(found.state, wanted, said, batch_size=found.batch_size)
 
 
 def leaves(whole: WorldState | Plan | Scene) -> list[Tensor]:

@@ -1,7 +1,6 @@
 """Numbered scenes: every number is one fixed initial state, with a suitable goal where asked for.
 
-A stream of scenes is a function of its seed and name, so that a scene can be drawn again by its
-number, training and evaluation never meet, and results can name the scenes that they are about.
+A stream is a function of its seed and name: a scene can be drawn again by its number.
 """
 
 from __future__ import annotations

@@ -13,15 +13,9 @@ UP, RIGHT, DOWN, LEFT, PICK_PLACE, STOP = range(6)
 
 
 def neighbour(cell: Tensor, direction: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Return the cell next to ``cell`` and whether it lies on the grid.
+    """Return the cell next to ``cell``, int64 [*B], or itself, and whether it lies on the grid.
 
-    Args:
-        cell: cells, int64 [*B].
-        direction: 0..3 for up, right, down, left, int64 [*B].
-        size: cells along one side.
-
-    Returns:
-        The neighbour (the cell itself where off the grid), int64 [*B], and a bool [*B].
+    Directions are 0..3 for up, right, down, left, int64 [*B].
     """
     row, column = cell // size, cell % size
     row = row + (direction == DOWN).long() - (direction == UP).long()
