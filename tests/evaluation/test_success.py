@@ -251,7 +251,7 @@ def test_values_logits_actions_of_another_shape_and_worlds_without_an_image_are_
 def test_success_is_seen_from_the_true_reward_where_there_are_others(up):
     zeros = lambda action: torch.zeros(*action.shape, 1)  # noqa: E731
     model = TensorDictModule(zeros, ["action"], ["action_score"])
-    plain = PickAndPlaceEnv("move", num_envs=100, seed=0)
+    plain = TransformedEnv(PickAndPlaceEnv("move", num_envs=100, seed=0))
     paid = TransformedEnv(PickAndPlaceEnv("move", num_envs=100, seed=0), LearnedReward(model))
     result = success_rate(up, paid, episodes=200)
     assert torch.equal(result.outcomes, success_rate(up, plain, episodes=200).outcomes)
