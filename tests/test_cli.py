@@ -79,20 +79,23 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["tsk=move"], "unknown option 'tsk' (did you mean 'task'?): there are "),
-        (["imitate.steps=many"], "option imitate.steps: value 'many'"),
-        (["imitate.lr=-1"], "imitate: lr must be above 0"),
-        (["task=a,b"], "ambiguous value for argument 'task=a,b'"),
-        (["=3"], "config group override must be"),
-        (["preset=null"], "config group override must be"),
-        (["--resolve"], "lexernoviablealtexception"),
-        (["task=${nonexistent}"], "option run: interpolation key 'nonexistent' not found"),
-        (["task=fly"], "unknown task 'fly': choose move or pick"),
-        (["-m", "preset=paper,huge"], "unknown preset 'huge': choose one of paper, strong"),
+        ("demoo", "unknown command 'demoo' (did you mean 'demo'?): choose one of demo, "),
+        ("run", "which recipe? choose one of greet"),
+        ("run great", "unknown recipe 'great' (did you mean 'greet'?): choose one of greet"),
+        ("run greet tsk=move", "unknown option 'tsk' (did you mean 'task'?): there are "),
+        ("run greet imitate.steps=many", "option imitate.steps: value 'many'"),
+        ("run greet imitate.lr=-1", "imitate: lr must be above 0"),
+        ("run greet task=a,b", "ambiguous value for argument 'task=a,b'"),
+        ("run greet =3", "config group override must be"),
+        ("run greet preset=null", "config group override must be"),
+        ("run greet --resolve", "lexernoviablealtexception"),
+        ("run greet task=${nonexistent}", "option run: interpolation key 'nonexistent' not found"),
+        ("run greet task=fly", "unknown task 'fly': choose move or pick"),
+        ("run greet -m preset=paper,huge", "unknown preset 'huge': choose one of paper, strong"),
     ],
 )
 def test_a_mistake_gets_one_line_and_code_2(recipes, capsys, arguments, said):
-    assert run("run", "greet", *arguments) == 2
+    assert run(*arguments.split()) == 2
     printed = capsys.readouterr()
     assert printed.err.lower().startswith(f"error: {said}".lower())
     assert printed.err.count("\n") == 1 and not printed.out
@@ -139,11 +142,17 @@ def test_help_of_a_recipe_lists_its_options(recipes, capsys):
     assert run("run", "greet", "tsk=pick", "--help") == 2
 
 
-def test_help_of_a_recipe_shows_what_it_reads(capsys):
+def test_help_of_a_recipe_shows_what_it_reads_and_has_of_its_own(capsys):
     assert run("run", "imitate", "--help") == 0
     printed = capsys.readouterr().out
     assert "\n  imitate.lr=" in printed and "\n  networks.dropout=" in printed
     assert "self_examine" not in printed and "ifo-grounding demo --help" in printed
+    assert run("run", "reproduce", "table=2", "--help") == 0
+    printed = capsys.readouterr().out
+    assert "\n  table=2 " in printed and "Of the paper: 2, 3 or 4." in printed
+    assert run("run", "reproduce", "preset=strong") == 2
+    assert run("run", "reproduce", "table=7") == 2
+    assert "unknown table 7: choose one of 2, 3, 4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("module", ["ifo_grounding", "ifo_grounding.cli"])
@@ -154,35 +163,11 @@ def test_the_package_is_the_command_too(module, capsys, monkeypatch):
     assert capsys.readouterr().out.startswith("ifo-grounding ")
 
 
-def test_help_of_recipes_with_options_of_their_own(capsys):
-    assert run("run", "reproduce", "table=2", "--help") == 0
-    printed = capsys.readouterr().out
-    assert "\n  table=2 " in printed and "Of the paper: 2, 3 or 4." in printed
-    assert run("run", "reproduce", "preset=strong") == 2
-    assert run("run", "reproduce", "table=7") == 2
-    assert "unknown table 7: choose one of 2, 3, 4" in capsys.readouterr().err
-
-
 def test_help_ends_where_its_reader_does():
     script = recipes_folder() / "imitate.py"
     command = f"{sys.executable} {script} --help | head -1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
     assert (done.stdout.count("\n"), done.stderr) == (1, "")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["demoo"], "unknown command 'demoo' (did you mean 'demo'?): choose one of demo, "),
-        (["run"], "which recipe? choose one of greet"),
-        (["run", "great"], "unknown recipe 'great' (did you mean 'greet'?): choose one of greet"),
-    ],
-)
-def test_an_unknown_command_or_recipe_is_named(recipes, capsys, arguments, said):
-    assert run(*arguments) == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith(f"error: {said}")
-    assert printed.count("\n") == 1
 
 
 def test_help_and_version(capsys):

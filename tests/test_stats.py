@@ -27,26 +27,33 @@ def few_resamples(monkeypatch):
     monkeypatch.setattr(rates, "RESAMPLES", 10)
 
 
-def test_wilson_by_hand():
+def test_wilson_by_hand_and_of_nothing():
     # 8 of 10, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half 1.96 / 1.38415 * sqrt(0.025604).
     rate = wilson(8, 10)
     assert rate.rate == 0.8
     assert rate.low == pytest.approx(0.4901625, abs=1e-6)
     assert rate.high == pytest.approx(0.9433178, abs=1e-6)
     assert wilson(0, 20).low == 0.0 and wilson(20, 20).high == 1.0
-
-
-def test_wilson_of_nothing_says_so_and_stays_valid_json():
     rate = wilson(0, 0)
     assert math.isnan(rate.rate) and (rate.low, rate.high) == (0.0, 1.0)
     assert str(rate) == "undefined (n=0)"
     assert json.loads(json.dumps(rate.as_dict(), allow_nan=False))["rate"] is None
 
 
-@pytest.mark.parametrize(("successes", "count"), [(-1, 3), (4, 3), (3.7, 5), (math.nan, 5)])
-def test_wilson_refuses_what_are_no_counts(successes, count):
-    with pytest.raises(UserError, match=r"successes must be 0\.\.count"):
-        wilson(successes, count)
+def test_what_are_no_counts_no_table_no_probabilities_and_no_scores_is_refused():
+    for successes, count in ((-1, 3), (4, 3), (3.7, 5), (math.nan, 5)):
+        with pytest.raises(UserError, match=r"successes must be 0\.\.count"):
+            wilson(successes, count)
+    for table in ([], [[[1]]], [0.5, 1.0]):
+        with pytest.raises(UserError, match="outcomes must be"):
+            two_level_bootstrap(table)
+    for wrong in ([0.5], [0, 1]), ([1.2], [1]):
+        with pytest.raises(UserError, match="reliability needs probabilities"):
+            reliability(*wrong)
+    with pytest.raises(UserError, match="finite"):
+        auc([1.0, math.nan], [1, 0])
+    with pytest.raises(UserError, match="3 scores need as many"):
+        auc([1, 2, 0], [1, 1, 0], groups=[0, 0])
 
 
 def test_rate_reads_as_a_person_writes_it():
@@ -88,12 +95,6 @@ def test_bootstrap_draws_as_one_by_one_would():
     low, high = np.quantile(means, (0.025, 0.975))
     assert rate.low == pytest.approx(low, abs=0.012)  # two steps of 1 / 180
     assert rate.high == pytest.approx(high, abs=0.012)
-
-
-@pytest.mark.parametrize("bad", [[], [[[1]]], [0.5, 1.0]])
-def test_bootstrap_refuses_what_is_not_a_table_of_outcomes(bad):
-    with pytest.raises(UserError, match="outcomes must be"):
-        two_level_bootstrap(bad)
 
 
 def test_paired_difference_by_hand():
@@ -239,13 +240,6 @@ def test_auc_of_groups_knows_that_copies_add_nothing():
     assert naive.high - naive.low < 0.6 * (once.high - once.low)
 
 
-def test_auc_refuses_broken_scores():
-    with pytest.raises(UserError, match="finite"):
-        auc([1.0, math.nan], [1, 0])
-    with pytest.raises(UserError, match="3 scores need as many"):
-        auc([1, 2, 0], [1, 1, 0], groups=[0, 0])
-
-
 def test_reliability_of_a_calibrated_and_of_an_overconfident_forecast():
     source = np.random.default_rng(0)
     said = source.uniform(size=200_000)
@@ -255,6 +249,3 @@ def test_reliability_of_a_calibrated_and_of_an_overconfident_forecast():
     [(share, rate)] = reliability(np.full(1000, 0.95), source.uniform(size=1000) < 0.5)
     assert share == pytest.approx(0.95) and rate.high < 0.6 and rate.count == 1000
     assert reliability([1.0], [True])[0][1].successes == 1
-    for wrong in ([0.5], [0, 1]), ([1.2], [1]):
-        with pytest.raises(UserError, match="reliability needs probabilities"):
-            reliability(*wrong)

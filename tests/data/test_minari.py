@@ -83,7 +83,6 @@ def test_datasets_of_others_are_read_as_they_were_recorded(kind, jpeg):
 
 
 def test_actions_are_never_read(folder):
-    """A file without actions, which Minari itself cannot read, gives the same demonstrations."""
     whole, _ = another("other-v0")
     expected = from_minari(whole, image="view")
     path = folder / "other-v0" / "data" / "main_data.hdf5"
@@ -133,9 +132,8 @@ def test_what_lies_in_another_file_is_not_read(where, folder, tmp_path):
 
 def test_grey_and_channels_first_images_are_read():
     grey = another("grey-v0", 1, space(40, 48), lambda views, _: {"view": views[..., 0]})[0]
-    first, views = another(
-        "first-v0", 2, space(3, 40, 48), lambda views, _: {"view": views.transpose(0, 3, 1, 2)}
-    )
+    turned = lambda views, _: {"view": views.transpose(0, 3, 1, 2)}  # noqa: E731
+    first, views = another("first-v0", 2, space(3, 40, 48), turned)
     for dataset in (grey, first):
         dataset.storage.update_metadata({"mission": "go on"})
     assert from_minari(grey, image="view").image_shape == (1, 40, 48)

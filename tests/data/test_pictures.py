@@ -50,25 +50,21 @@ def make_video(path, frames=20, size=(32, 16), codec="libx264", **tags):
         for number in range(frames):
             shown = np.full((*size[::-1], 3), 10 * number, np.uint8)
             shown[: size[1] // 2] = 255
-            noise = draw.integers(256, size=shown.shape, dtype=np.uint8)
-            video.mux(
-                stream.encode(av.VideoFrame.from_ndarray(noise if codec == "mjpeg" else shown))
-            )
+            if codec == "mjpeg":
+                shown = draw.integers(256, size=shown.shape, dtype=np.uint8)
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(shown)))
         video.mux(stream.encode())
     return path
 
 
-def test_pictures_come_back_as_they_were(demos, tmp_path):
+def test_pictures_come_back_as_they_were_and_videos_at_twice_the_size(demos, tmp_path):
     save_pictures(demos, tmp_path / "shown")
     back = load_pictures(tmp_path / "shown", vocabulary=VOCABULARY)
     assert_same(back, demos)
     assert torch.equal(back.tokens, demos.tokens)
-
-
-def test_videos_show_every_frame_at_twice_the_size(demos, tmp_path):
     demos = demos[:2]
-    save_pictures(demos, tmp_path / "shown", kind="mp4", scale=2)
-    back = load_pictures(tmp_path / "shown", close=False)
+    save_pictures(demos, tmp_path / "filmed", kind="mp4", scale=2)
+    back = load_pictures(tmp_path / "filmed", close=False)
     assert back.sentences() == demos.sentences()
     assert torch.equal(back.lengths, demos.lengths)
     assert back.image_shape == (3, 96, 96)
@@ -99,20 +95,17 @@ def test_frames_that_cannot_be_written_are_refused(kind, shape, said, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_has_no_instruction_is_not_written(tmp_path):
-    frames = [torch.zeros(2, 3, 8, 8, dtype=torch.uint8)] * 2
-    tokens = torch.tensor([[1], [0]])
-    demos = Demonstrations.from_arrays(frames, tokens, vocabulary=Vocabulary(["up"], length=1))
-    with pytest.raises(UserError, match="demonstration 1 has no instruction"):
-        save_pictures(demos, tmp_path / "pictures")
-
-
-def test_what_is_there_is_not_replaced(demos, tmp_path):
+def test_what_is_there_is_not_replaced_and_what_has_no_instruction_not_written(demos, tmp_path):
     save_pictures(demos[:1], tmp_path)
     before = sorted(tmp_path.rglob("*"))
     for folder in (tmp_path, tmp_path / "episodes.jsonl"):
         with pytest.raises(UserError, match="exists and is no empty folder: name another one"):
             save_pictures(demos, folder)
+    frames = [torch.zeros(2, 3, 8, 8, dtype=torch.uint8)] * 2
+    tokens, words = torch.tensor([[1], [0]]), Vocabulary(["up"], length=1)
+    silent = Demonstrations.from_arrays(frames, tokens, vocabulary=words)
+    with pytest.raises(UserError, match="demonstration 1 has no instruction"):
+        save_pictures(silent, tmp_path / "pictures")
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -274,7 +267,7 @@ def test_a_recording_that_was_cut_stays_open(tmp_path):
 
 
 def test_a_video_may_hold_frames_that_are_not_shown(tmp_path):
-    """Editors that cut without encoding anew keep what comes before, from a whole frame on."""
+    # Editors that cut without encoding anew keep what comes before, from a whole frame on.
     whole, part = make_video(tmp_path / "whole.mp4"), tmp_path / "part.mp4"
     with av.open(whole) as source, av.open(part, "w") as target:
         stream = source.streams.video[0]

@@ -31,9 +31,8 @@ def test_make_vec_is_native():
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     observations, infos = envs.reset(seed=0)
     assert observations in envs.observation_space
-    assert (
-        envs.single_observation_space == gymnasium.make("ifo_grounding/Pick-v0").observation_space
-    )
+    one = gymnasium.make("ifo_grounding/Pick-v0")
+    assert envs.single_observation_space == one.observation_space
     assert envs.action_space.shape == (5,)
     said = VOCABULARY.decode(torch.from_numpy(observations["instruction"]))
     assert infos["instruction_text"].tolist() == said
@@ -43,12 +42,10 @@ def test_make_vec_is_native():
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_one_world_many_worlds_and_torchrl_agree(mode):
     """The same scenes and actions give the same pixels, words, rewards and ends in all three."""
-    n, options = 6, {"max_steps": 9}
-    batch = PickAndPlaceEnv("pick-out", n, seed=9, **options)
-    envs = gymnasium.make_vec(
-        "ifo_grounding/PickOut-v0", num_envs=n, autoreset_mode=mode, **options
-    )
-    one = gymnasium.make("ifo_grounding/PickOut-v0", **options)
+    n, name = 6, "ifo_grounding/PickOut-v0"
+    batch = PickAndPlaceEnv("pick-out", n, seed=9, max_steps=9)
+    envs = gymnasium.make_vec(name, num_envs=n, autoreset_mode=mode, max_steps=9)
+    one = gymnasium.make(name, max_steps=9)
     td, (seen, infos), (single, info) = batch.reset(), envs.reset(seed=9), one.reset(seed=9)
     draw = np.random.default_rng(0)
     live, success = np.ones(n, bool), 0.0
@@ -108,9 +105,7 @@ def test_next_step_autoreset_takes_a_step_of_its_own():
 
 
 def test_without_autoreset_the_caller_resets():
-    envs = gymnasium.make_vec(
-        "ifo_grounding/Move-v0", num_envs=3, autoreset_mode=AutoresetMode.DISABLED
-    )
+    envs = PickAndPlaceVectorEnv("move", 3, autoreset_mode=AutoresetMode.DISABLED)
     before, _ = envs.reset(seed=0)
     envs.step(np.array([STOP, UP, STOP]))
     with pytest.raises(UserError, match="2 worlds have ended"):
@@ -127,9 +122,8 @@ def test_without_autoreset_the_caller_resets():
 def test_infos_equal_those_of_gymnasium_s_own_vectorizer():
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
         native = gymnasium.make_vec("ifo_grounding/Move-v0", 2, autoreset_mode=mode)
-        loop = gymnasium.make_vec(
-            "ifo_grounding/Move-v0", 2, "sync", vector_kwargs={"autoreset_mode": mode}
-        )
+        chosen = {"vector_kwargs": {"autoreset_mode": mode}}
+        loop = gymnasium.make_vec("ifo_grounding/Move-v0", 2, "sync", **chosen)
         formats = []
         for envs in (native, loop):
             seen = [shape(envs.reset(seed=0)[1])]

@@ -96,6 +96,15 @@ def test_scenes_can_be_asked_for_by_number():
     # Whoever asks does not use up the stream.
     env.reset()
     assert env.scene_numbers.tolist() == [12, 13, 14]
+    asked = torch.tensor([[5], [6], [7]])
+    with pytest.raises(UserError, match=r"asked for by integers, got torch\.float32"):
+        env.reset(TensorDict({"scene": asked.float()}, [3]))
+    with pytest.raises(UserError, match="start at 0"):
+        env.reset(scenes(0, -1, 0))
+    assert env.scene_numbers.tolist() == [12, 13, 14]
+    first = env.reset(TensorDict({"scene": asked.int()}, [3]))
+    assert env.scene_numbers.tolist() == [5, 6, 7]
+    assert (env.reset(TensorDict({"scene": asked}, [3])) == first).all()
 
 
 def test_an_asked_scene_is_not_repeated_after_its_episode():
@@ -146,7 +155,6 @@ def moved(env):
     "change", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env)), moved]
 )
 def test_a_copied_or_moved_env_goes_on(change):
-    """Also where both run side by side, and their goals are checked."""
     actions = torch.randint(6, (12, 64), generator=torch.Generator().manual_seed(0))
     env = PickAndPlaceEnv("pick", 64, seed=3)
     shown = env.reset()
@@ -202,20 +210,6 @@ def test_many_worlds_run_with_deterministic_algorithms():
     finally:
         torch.use_deterministic_algorithms(False)
     assert torch.equal(rollout["next", "pixels"][:, -1], render(env.truth.state))
-
-
-def test_scene_numbers_are_any_whole_numbers():
-    env = PickAndPlaceEnv("move", num_envs=2, seed=0)
-    env.reset()
-    asked = torch.tensor([[5], [6]])
-    with pytest.raises(UserError, match=r"asked for by integers, got torch\.float32"):
-        env.reset(TensorDict({"scene": asked.float()}, [2]))
-    with pytest.raises(UserError, match="start at 0"):
-        env.reset(scenes(0, -1))
-    assert env.scene_numbers.tolist() == [0, 1]
-    first = env.reset(TensorDict({"scene": asked.int()}, [2]))
-    assert env.scene_numbers.tolist() == [5, 6]
-    assert (env.reset(TensorDict({"scene": asked}, [2])) == first).all()
 
 
 def test_who_steps_before_a_reset_is_told():

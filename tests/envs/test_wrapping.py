@@ -37,17 +37,10 @@ def test_specs_hold(instructed):
 
 
 def test_an_id_is_made_with_its_options():
-    env = from_gymnasium(
-        "ifo_grounding/Move-v0",
-        vocabulary=VOCABULARY,
-        image="pixels",
-        instruction="instruction_text",
-        num_envs=2,
-        tile_size=16,
-    )
-    td = env.reset()
+    keys = {"vocabulary": VOCABULARY, "image": "pixels", "instruction": "instruction_text"}
+    td = from_gymnasium("ifo_grounding/Move-v0", num_envs=2, tile_size=16, **keys).reset()
     assert td["pixels"].shape == (2, 3, 96, 96)
-    assert all(sentence for sentence in VOCABULARY.decode(td["instruction"]))
+    assert all(VOCABULARY.decode(td["instruction"]))
 
 
 def shown(pixels):
@@ -59,6 +52,12 @@ def wanted(td):
     return torch.tensor([MARKS.index(text.split()[-1]) for text in WORDS.decode(td["instruction"])])
 
 
+def knows(td):
+    """Turn the dial to the mark of the instruction, and press."""
+    away = wanted(td) - shown(td["pixels"])
+    return td.set("action", torch.where(away == 0, PRESS, (away > 0).long()))
+
+
 def test_instructions_and_rewards_are_the_world_s():
     env = dials(6)
     td = env.reset()
@@ -66,10 +65,9 @@ def test_instructions_and_rewards_are_the_world_s():
     assert (shown(td["pixels"]) != asked).all()
     earned = torch.zeros(6)
     for _ in range(6):
-        way = asked - shown(td["pixels"])
-        action = torch.where(way == 0, PRESS, (way > 0).long())
-        td = env.step(td.set("action", action))
-        assert torch.equal(td["next", "terminated"].squeeze(-1), way == 0)
+        there = shown(td["pixels"]) == asked
+        td = env.step(knows(td))
+        assert torch.equal(td["next", "terminated"].squeeze(-1), there)
         earned += td["next", "reward"].squeeze(-1)
         td = env.step_mdp(td)
     assert earned.tolist() == [1.0] * 6  # what has ended stays as it is, and pays no more
@@ -103,8 +101,7 @@ def test_partial_resets_touch_only_their_rows():
 
 
 def test_a_learner_sees_neither_reward_nor_the_world_s_own_goal():
-    env = dials(8, instructed=False, seed=1)
-    rollout = env.rollout(60, break_when_any_done=False)
+    rollout = dials(8, instructed=False, seed=1).rollout(60, break_when_any_done=False)
     assert not rollout["next", "reward"].any()
     assert not rollout["next", "terminated"].any()
     assert rollout["next", "truncated"].any()
@@ -134,12 +131,6 @@ def test_processes_show_what_one_process_shows(monkeypatch):
     apart.close()
     for key in ("pixels", "instruction", "action", ("next", "reward")):
         assert torch.equal(apart.seen[key], together.seen[key])
-
-
-def knows(td):
-    """Turn the dial to the mark of the instruction, and press."""
-    away = wanted(td) - shown(td["pixels"])
-    return td.set("action", torch.where(away == 0, PRESS, (away > 0).long()))
 
 
 def test_episodes_are_recorded_as_they_are_counted():

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Binary, Bounded, Categorical, Composite, OneHot, Unbounded
 from torchrl.envs import (
+    Compose,
     EnvBase,
     RenameTransform,
     RewardSum,
@@ -138,9 +139,7 @@ def test_modes_gradients_and_random_numbers_are_left_as_they_were(policy):
 
 
 def test_a_users_own_environment(random_policy):
-    env = TransformedEnv(
-        PickAndPlaceEnv("move", num_envs=32, seed=9), StepCounter()
-    ).append_transform(RewardSum())
+    env = TransformedEnv(PickAndPlaceEnv("move", 32, seed=9), Compose(StepCounter(), RewardSum()))
     first = success_rate(random_policy, env, episodes=80, mode="sampled")
     second = success_rate(RandomPolicy(env.action_spec), env, episodes=80, mode="sampled")
     assert first.rate.count == 80
@@ -178,6 +177,8 @@ def choosing():
         (lambda p: success_rate(p, PickAndPlaceEnv(instructed=False)), "instructed"),
         (lambda p: success_rate(p, choosing()), "pays no true reward"),
         (lambda p: success_rate(p, PickAndPlaceEnv(), tile_size=8), "tile_size"),
+        (lambda p: success_rate(p, "move", batch_size=2.5), "batch_size must be a whole number"),
+        (lambda p: success_rate(p, Patient(), max_steps=0), "max_steps must be at least 1"),
     ],
 )
 def test_mistakes_get_one_clear_line(call, message, random_policy):
@@ -230,14 +231,14 @@ def test_other_worlds_end_by_themselves(up):
     assert success_rate(up, Patient(), episodes=4, max_steps=59).rate.rate == 0.0
 
 
-def test_actions_of_another_shape_are_refused(up):
+def test_values_logits_actions_of_another_shape_and_worlds_without_an_image_are_refused(up):
     one_hot = Patient()
     one_hot.action_spec = OneHot(6, shape=(2, 6))
     with pytest.raises(UserError, match=r"shape \[2\].*takes \[2, 6\].*categorical_action"):
         success_rate(up, one_hot, episodes=2)
-
-
-def test_values_and_logits_are_no_actions():
+    renamed = TransformedEnv(Patient(), RenameTransform(["pixels"], ["camera"]))
+    with pytest.raises(UserError, match="its image under 'pixels'"):
+        success_rate(up, renamed, episodes=2)
     speaks = lambda td: td.set("action", torch.full(td.shape, 5.9))  # noqa: E731
     logits = TensorDictModule(lambda pixels: pixels[:, 0, 0, :6].float(), ["pixels"], ["logits"])
     for world in ("move", Patient()):
@@ -247,22 +248,11 @@ def test_values_and_logits_are_no_actions():
             success_rate(logits, world, episodes=2)
 
 
-def test_no_steps_and_no_image_are_refused(up):
-    with pytest.raises(UserError, match="max_steps must be at least 1"):
-        success_rate(up, Patient(), episodes=2, max_steps=0)
-    renamed = TransformedEnv(Patient(), RenameTransform(["pixels"], ["camera"]))
-    with pytest.raises(UserError, match="its image under 'pixels'"):
-        success_rate(up, renamed, episodes=2)
-
-
 def test_success_is_seen_from_the_true_reward_where_there_are_others(up):
-    model = TensorDictModule(
-        lambda action: torch.zeros(*action.shape, 1), ["action"], ["action_score"]
-    )
-    plain, paid = (
-        TransformedEnv(PickAndPlaceEnv("move", num_envs=100, seed=0), transform)
-        for transform in (None, LearnedReward(model))
-    )
+    zeros = lambda action: torch.zeros(*action.shape, 1)  # noqa: E731
+    model = TensorDictModule(zeros, ["action"], ["action_score"])
+    plain = TransformedEnv(PickAndPlaceEnv("move", num_envs=100, seed=0))
+    paid = TransformedEnv(PickAndPlaceEnv("move", num_envs=100, seed=0), LearnedReward(model))
     result = success_rate(up, paid, episodes=200)
     assert torch.equal(result.outcomes, success_rate(up, plain, episodes=200).outcomes)
     assert 0 < result.rate.successes < 20
@@ -274,5 +264,3 @@ def test_success_is_seen_from_the_true_reward_where_there_are_others(up):
 def test_numbers_of_numpy_are_numbers(random_policy):
     sizes = {"episodes": np.int64(5), "batch_size": np.int64(2)}
     assert success_rate(random_policy, "move", **sizes).rate.count == 5
-    with pytest.raises(UserError, match="batch_size must be a whole number"):
-        success_rate(random_policy, "move", episodes=5, batch_size=2.5)

@@ -28,11 +28,8 @@ def as_classifier(function):
 
 def oracle(task, states, flip=0.0):
     """A classifier that recognises the fresh states by their pictures and asks the truth."""
-    state = (
-        SceneStream(SceneOptions(task, instructed=False, stream="evaluation"), 0)
-        .scenes(torch.arange(states))
-        .state
-    )
+    stream = SceneStream(SceneOptions(task, instructed=False, stream="evaluation"), 0)
+    state = stream.scenes(torch.arange(states)).state
     numbers = {picture.numpy().tobytes(): row for row, picture in enumerate(render(state, 8))}
     lies = torch.Generator().manual_seed(1)
 
@@ -114,12 +111,10 @@ def test_nothing_above_the_threshold():
 
 
 def test_a_real_classifier_and_its_reproducibility():
-    env = PickAndPlaceEnv("move", num_envs=1, seed=0)
+    env, pool = PickAndPlaceEnv("move", num_envs=1, seed=0), grammar("move").tokens
     classifier = make_instruction_classifier(env, "paper", seed=0).train()
     options = {"states": 200, "threshold": 0.4, "candidates": 5}
-    first, again = (
-        suitable_rate(classifier, "move", grammar("move").tokens, **options) for _ in range(2)
-    )
+    first, again = (suitable_rate(classifier, "move", pool, **options) for _ in range(2))
     assert first.as_dict() == again.as_dict()
     assert classifier.training
     assert first.precision.count > 0

@@ -179,6 +179,5 @@ def test_networks_of_another_precision_read_all_images(
         data[name] = pixels.clone() if image == torch.uint8 else pixels / 255
     network = MAKERS[kind](shapes, preset, seed=0)
     expected, _ = run(kind, network, data)
-    torch.testing.assert_close(
-        run(kind, network.to(precision), data)[0].float(), expected, atol=off, rtol=off
-    )
+    found = run(kind, network.to(precision), data)[0].float()
+    torch.testing.assert_close(found, expected, atol=off, rtol=off)

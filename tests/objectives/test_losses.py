@@ -65,28 +65,19 @@ ODDS = 9.0, 1.5
 """Of 0.9 and 0.6."""
 
 
-def test_inverse_loss_by_hand():
+def test_inverse_and_imitation_loss_by_hand_and_one_hot_is_never_confused_with_categorical():
     network = TensorDictModule(Answer(LOGITS), in_keys=["pixels"], out_keys=["guess"])
-    out = InverseLoss(network)(labelled([1, 2]))
-    assert out["loss_inverse"].item() == pytest.approx(-(math.log(0.25) + math.log(0.8)) / 2)
-    assert float(out["accuracy"]) == 0.5
-
-
-def test_imitation_loss_by_hand():
-    out = ImitationLoss(actor(LOGITS))(labelled([1, 2]))
-    assert out["loss_imitation"].item() == pytest.approx(-(math.log(0.25) + math.log(0.8)) / 2)
-    assert float(out["accuracy"]) == 0.5
+    one_hot, hot = torch.tensor([[0, 1, 0], [0, 0, 1]]), actor(LOGITS, OneHotCategorical)
     first = 0.5 * math.log(2) + 0.5 * math.log(4)
     second = 0.2 * math.log(10) + 0.8 * math.log(1.25)
-    assert float(out["entropy"]) == pytest.approx((first + second) / 2)
-
-
-def test_one_hot_and_categorical_are_never_confused():
-    one_hot = torch.tensor([[0, 1, 0], [0, 0, 1]])
-    hot = actor(LOGITS, OneHotCategorical)
-    out = ImitationLoss(hot)(labelled([1, 2]).set("action", one_hot))
-    assert out["loss_imitation"].item() == pytest.approx(-(math.log(0.25) + math.log(0.8)) / 2)
-    assert float(out["accuracy"]) == 0.5
+    inverse = InverseLoss(network)(labelled([1, 2]))
+    imitation = ImitationLoss(actor(LOGITS))(labelled([1, 2]))
+    assert float(imitation["entropy"]) == pytest.approx((first + second) / 2)
+    of_hot = ImitationLoss(hot)(labelled([1, 2]).set("action", one_hot))
+    for out, name in ((inverse, "inverse"), (imitation, "imitation"), (of_hot, "imitation")):
+        expected = -(math.log(0.25) + math.log(0.8)) / 2
+        assert out[f"loss_{name}"].item() == pytest.approx(expected)
+        assert float(out["accuracy"]) == 0.5
     for loss in (ImitationLoss(actor(LOGITS)), InverseLoss(actor(LOGITS).module[0])):
         for wrong in (one_hot, torch.tensor([[1], [2]])):
             with pytest.raises(UserError, match="actions must have shape"):
@@ -108,9 +99,7 @@ class Suitability(nn.Module):
 
 def suitability(probabilities, written="suitability") -> TensorDictModule:
     table = torch.tensor([0.0, *map(logit, probabilities)])
-    return TensorDictModule(
-        Suitability(table), in_keys=["pixels", "instruction"], out_keys=[written]
-    )
+    return TensorDictModule(Suitability(table), ["pixels", "instruction"], [written])
 
 
 def suitable(**options):
@@ -198,9 +187,8 @@ def test_a_mixture_drops_nothing_however_many_are_suitable():
 def test_images_are_encoded_once_whatever_the_number_of_negatives():
     loss = make_loss("instruction", negatives=11)
     rows = []
-    loss.network.module.trunk.image.register_forward_hook(
-        lambda _, args, out: rows.append(len(out))
-    )
+    image = loss.network.module.trunk.image
+    image.register_forward_hook(lambda _, args, out: rows.append(len(out)))
     loss(batch((7,)))
     assert rows == [7]
 
@@ -279,13 +267,6 @@ def test_policies_may_be_parts_of_a_sequence(after):
     assert losses["loss_imitation"] == ImitationLoss(head)(labelled([1, 2]))["loss_imitation"]
 
 
-def test_what_is_no_policy_is_refused():
-    logits = TensorDictModule(Answer(LOGITS), in_keys=["pixels"], out_keys=["logits"])
-    for network in (logits, TensorDictSequential(logits)):
-        with pytest.raises(UserError, match=r"policies with get_dist, .* got TensorDict"):
-            ImitationLoss(network)
-
-
 def watched(share, *preset, **options):
     """A loss of suitable pairs that has seen a share of the negatives score as positives do."""
     loss = make_loss("instruction", *preset, removal_rate=None, **options)
@@ -322,28 +303,14 @@ def test_negatives_that_were_not_removed_count_as_the_mixture_that_they_are(pres
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
 def test_training_goes_on_after_calibration_as_if_there_had_been_none(share):
-    """Otherwise the loss would undo it, and a second calibration say it once more."""
     loss, data = watched(share), batch()
-    network = loss.network
-    before = seeded(loss.eval(), data)
+    network, before = loss.network, seeded(loss.eval(), data)
     likely = network(data.copy())["suitability"]
     loss.calibrate()
     calibrated = network(data.copy())["suitability"]
     assert (calibrated - likely).abs().min() > 0.1
     torch.testing.assert_close(seeded(loss, data).to_dict(), before.to_dict(), atol=0, rtol=0)
     assert torch.equal(network(data.copy())["suitability"], calibrated)
-
-
-def test_a_network_that_cannot_be_told_how_rare_suitable_pairs_are_is_named():
-    loss = InstructionLoss(suitability([0.9, 0.6]), TWO)
-    with pytest.raises(UserError, match=r"Suitability has no method expect\(share, mixed\)"):
-        loss.calibrate()
-
-
-def test_a_pool_of_another_length_is_refused():
-    loss = make_loss("instruction", pool=POOL[:, :-1])
-    with pytest.raises(UserError, match="one vocabulary"):
-        loss(batch())
 
 
 @pytest.mark.parametrize(
@@ -399,17 +366,24 @@ class Both(nn.Module):
 def test_the_output_learns_that_is_named_as_asked(kind, reads, written, count):
     data = batch()
     head = nn.Linear(len(reads), count)
-    network = TensorDictSequential(
-        TensorDictModule(Both(), reads, ["features"]),
-        TensorDictModule(head, ["features"], [written]),
-    )
-    total(kind(network)(data)).backward()
+    features = TensorDictModule(Both(), reads, ["features"])
+    named, other = (TensorDictModule(head, ["features"], [name]) for name in (written, "answer"))
+    total(kind(TensorDictSequential(features, named))(data)).backward()
     assert head.weight.grad.abs().sum() > 0
-    head_of_another_name = TensorDictModule(head, ["features"], ["answer"])
     with pytest.raises(UserError, match=f"one of them must be named '{written}'"):
-        kind(TensorDictSequential(network[0], head_of_another_name))
+        kind(TensorDictSequential(features, other))
 
 
-def test_the_number_of_actions_is_known():
+def test_networks_and_pools_that_do_not_fit_are_refused():
+    logits = TensorDictModule(Answer(LOGITS), in_keys=["pixels"], out_keys=["logits"])
+    for network in (logits, TensorDictSequential(logits)):
+        with pytest.raises(UserError, match=r"policies with get_dist, .* got TensorDict"):
+            ImitationLoss(network)
+    loss = InstructionLoss(suitability([0.9, 0.6]), TWO)  # cannot be told how rare they are
+    with pytest.raises(UserError, match=r"Suitability has no method expect\(share, mixed\)"):
+        loss.calibrate()
+    loss = make_loss("instruction", pool=POOL[:, :-1])
+    with pytest.raises(UserError, match="one vocabulary"):
+        loss(batch())
     with pytest.raises(UserError, match="give n_actions="):
         RewardLoss(TensorDictModule(Both(), ["pixels", "action"], ["action_score"]))

@@ -1,6 +1,7 @@
 """Both phases through the recipes: what they make, what is made once, what is refused."""
 
 import re
+import shutil
 import types
 
 import pytest
@@ -72,9 +73,8 @@ def test_both_phases_of_strong_run_through_and_write_a_report(options, tmp_path)
 def test_both_phases_of_paper_run_through_with_their_control(options, tmp_path):
     from two_phase import two_phase
 
-    results = two_phase(
-        options("task=pick-udlr", "preset=paper", "self_examine.pairs=24", "controls.run=true")
-    )
+    chosen = ["task=pick-udlr", "preset=paper", "self_examine.pairs=24", "controls.run=true"]
+    results = two_phase(options(*chosen))
     assert results["continued"]["scenes"] == results["phase2"]["scenes"]
     assert results["action_reward"] and results["changes"]
     audit = read_json(tmp_path / "run" / "metrics" / "self_examine.json")
@@ -92,13 +92,22 @@ def test_both_phases_run_on_a_gpu(options, preset):
     assert results["phase1"]["scenes"] == results["phase2"]["scenes"]
 
 
-def test_another_option_is_refused_before_anything_is_replaced(options, phase_1):
+def test_options_replace_values_and_other_options_or_networks_nothing(options, phase_1):
+    from _shared import load_network, open_run
     from imitate import imitate
 
     weights = (phase_1 / "policy-phase1.safetensors").read_bytes()
     with pytest.raises(UserError, match=r"made with imitate\.steps=20, not 30.*another run="):
         imitate(options("imitate.steps=30"))
     assert (phase_1 / "policy-phase1.safetensors").read_bytes() == weights
+    inverse = networks.load(phase_1 / "inverse.safetensors")
+    assert inverse.network_config.config.features == 16
+    with pytest.raises(UserError, match="sentence_rate"):
+        make_stages(options("networks.sentence_rate=0.5", run="second"), until="train_inverse")
+    other = networks.make_inverse(networks.Shapes((3, 8, 8), 9))
+    networks.save(other, phase_1 / "inverse.safetensors")  # of another run
+    with pytest.raises(UserError, match="not what was saved"):
+        load_network(open_run(options()), "inverse.safetensors", "train_inverse", options())
 
 
 def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, phase_1):
@@ -115,22 +124,6 @@ def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, 
     with pytest.raises(UserError, match="no finished stages"):
         two_phase(options(f"base={tmp_path / 'none'}", run="fourth"))
     assert not (tmp_path / "none").exists()
-
-
-def test_options_replace_values_of_every_network(options, phase_1):
-    inverse = networks.load(phase_1 / "inverse.safetensors")
-    assert inverse.network_config.config.features == 16
-    with pytest.raises(UserError, match="sentence_rate"):
-        make_stages(options("networks.sentence_rate=0.5", run="second"), until="train_inverse")
-
-
-def test_the_network_of_another_run_is_refused(options, phase_1):
-    from _shared import load_network, open_run
-
-    other = networks.make_inverse(networks.Shapes((3, 8, 8), 9))
-    networks.save(other, phase_1 / "inverse.safetensors")
-    with pytest.raises(UserError, match="not what was saved"):
-        load_network(open_run(options()), "inverse.safetensors", "train_inverse", options())
 
 
 def test_a_stage_without_what_it_needs_says_what_to_run(options, tmp_path, monkeypatch):
@@ -190,11 +183,8 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
     )
     for part, last in (("about_form.weight", True), ("role.weight", False)):
         weight = theirs.state_dict()[part]
-        assert [torch.equal(words.state_dict()[part], weight) for words in own] == [
-            True,
-            True,
-            last,
-        ]
+        alike = [torch.equal(words.state_dict()[part], weight) for words in own]
+        assert alike == [True, True, last]
     heads = [each.network.module.head[1].weight for each in tried]
     assert not torch.equal(heads[0], heads[1])
     assert fresh_states(given, 301) is None
@@ -203,10 +193,8 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
 
 
 @pytest.mark.parametrize("mode", ["greedy", "sampled"])
-def test_changed_scenes_are_shown_of_the_policy_that_was_measured(
-    options, mode, phase_1, monkeypatch
-):
-    """Actions that were drawn are not drawn again: what they solved may fail in the picture."""
+def test_changed_scenes_are_shown_of_what_was_measured(options, mode, phase_1, monkeypatch):
+    # Actions that were drawn are not drawn again: what they solved may fail in the picture.
     from _shared import open_run
 
     import report
@@ -214,13 +202,9 @@ def test_changed_scenes_are_shown_of_the_policy_that_was_measured(
     monkeypatch.setattr(report, "step_by_step", lambda *_: {})  # slow to draw
     given = options()
     run = open_run(given)
-    (run / "policy-phase2.safetensors").write_bytes(
-        (run / "policy-phase1.safetensors").read_bytes()
-    )
-    outcomes = {"phase1": torch.zeros(20), "phase2": torch.ones(20)}
-    results = {
-        phase: {"mode": mode, **by_scene(solved.bool())} for phase, solved in outcomes.items()
-    }
+    shutil.copy(run / "policy-phase1.safetensors", run / "policy-phase2.safetensors")
+    outcomes = {"phase1": torch.zeros(20).bool(), "phase2": torch.ones(20).bool()}
+    results = {phase: {"mode": mode, **by_scene(which)} for phase, which in outcomes.items()}
     found = report.episode_pictures(run, given, results)
     assert "Episodes of phase 2" in found
     assert ("Solved by phase 2 alone" in found) == (mode == "greedy")
@@ -232,10 +216,9 @@ def test_what_is_measured_otherwise_is_measured_anew(options, capsys, phase_1):
     found = evaluate(options("evaluate.episodes=20", "evaluate.mode=sampled"))["phase1"]
     assert (found["rate"]["count"], found["mode"]) == (20, "sampled")
     assert not capsys.readouterr().err
-    again = evaluate(
-        options("evaluate.episodes=10", "evaluate.mode=greedy", "evaluate.split=zero-shot")
-    )
-    assert again["phase1"]["rate"]["count"] == 10 and not again["phase1"]["sampled"]
+    chosen = ["evaluate.episodes=10", "evaluate.mode=greedy", "evaluate.split=zero-shot"]
+    again = evaluate(options(*chosen))["phase1"]
+    assert again["rate"]["count"] == 10 and not again["sampled"]
     # The demonstrations named the pairs of these scenes, too.
     assert "no zero-shot success" in capsys.readouterr().err
 

@@ -13,7 +13,7 @@ from ifo_grounding.training import Checkpoint, Run
 OPTIONS = {"task": "move", "threads": 1, "imitate": {"steps": 900, "lr": 1e-5, "held_out": None}}
 
 
-def test_names_live_under_the_home_folder_and_paths_where_they_say(tmp_path, monkeypatch):
+def test_a_run_has_a_name_or_a_path_and_a_known_logger(tmp_path, monkeypatch):
     monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     assert Run("mine").folder == tmp_path / "runs" / "mine"
@@ -22,6 +22,9 @@ def test_names_live_under_the_home_folder_and_paths_where_they_say(tmp_path, mon
     assert Run(".").folder.resolve() == tmp_path
     with pytest.raises(UserError, match="needs a name"):
         Run("")
+    with pytest.raises(UserError, match="unknown logger 'paper'"):
+        Run(tmp_path, logger="paper")
+    assert Run(tmp_path, logger="none").stage("a").log() is None
 
 
 @pytest.mark.parametrize(
@@ -166,12 +169,6 @@ def test_all_stages_of_a_run_are_one_run_of_wandb(tmp_path, monkeypatch):
     assert made[2][0] == "other" and made[2][1] != made[0][1]
 
 
-def test_an_unknown_logger_is_refused(tmp_path):
-    with pytest.raises(UserError, match="unknown logger 'paper'"):
-        Run(tmp_path, logger="paper")
-    assert Run(tmp_path, logger="none").stage("a").log() is None
-
-
 @pytest.fixture
 def first(tmp_path):
     """A run of two finished stages."""
@@ -186,7 +183,7 @@ def first(tmp_path):
     return run
 
 
-def test_a_run_takes_over_what_another_has_finished(tmp_path, first):
+def test_a_run_takes_over_what_another_has_finished_into_a_folder_of_none(tmp_path, first):
     second = Run(tmp_path / "second")
     with second.lock():
         second.take_over(first, without=["self_examine", "other.safetensors"])
@@ -197,6 +194,12 @@ def test_a_run_takes_over_what_another_has_finished(tmp_path, first):
     second.stage("imitate").finish({"of": "second"})
     second.take_over(first)  # it has begun: nothing is overwritten
     assert second.stage("imitate").result == {"of": "second"}
+    with pytest.raises(UserError, match="no finished stages"):
+        Run(tmp_path / "third").take_over(Run(tmp_path / "nowhere"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").touch()
+    with pytest.raises(UserError, match="holds other files"):
+        Run(tmp_path / "other").take_over(first)
 
 
 def test_a_take_over_that_was_killed_goes_on(tmp_path, first, monkeypatch):
@@ -216,15 +219,6 @@ def test_a_take_over_that_was_killed_goes_on(tmp_path, first, monkeypatch):
     second.take_over(first)
     assert second.stage("self_examine").result == {"of": "self_examine"}
     assert (second / "policy.safetensors").exists() and not (second / ".taken").exists()
-
-
-def test_only_runs_are_taken_over_into_folders_of_none(tmp_path, first):
-    with pytest.raises(UserError, match="no finished stages"):
-        Run(tmp_path / "third").take_over(Run(tmp_path / "nowhere"))
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "thesis.tex").touch()
-    with pytest.raises(UserError, match="holds other files"):
-        Run(tmp_path / "other").take_over(first)
 
 
 def hold(folder, held, let_go):
@@ -259,11 +253,7 @@ def test_one_process_at_a_time_works_on_a_run(tmp_path):
 
 def test_what_is_not_of_a_run_stays(tmp_path):
     others = [".notes.tmp", ".draft.txt.bak.tmp", "stages/.mine.tmp", "src/.a.12345678.tmp"]
-    ours = [
-        ".policy.pt.1a2b3c4d.tmp",
-        ".labels.1a2b3c4d.old",
-        "stages/.a.json.1a2b3c4d.tmp",
-    ]
+    ours = [".policy.pt.1a2b3c4d.tmp", ".labels.1a2b3c4d.old", "stages/.a.json.1a2b3c4d.tmp"]
     for name in (*others, *ours):
         (tmp_path / name).mkdir(parents=True)
     with Run(tmp_path).lock():
@@ -277,11 +267,9 @@ def test_a_file_system_without_locks_gets_a_warning(tmp_path, monkeypatch):
         pass
 
 
-@pytest.mark.parametrize("made", [False, True])
-def test_a_run_of_which_nothing_came_leaves_nothing(tmp_path, made):
+def test_a_run_of_which_nothing_came_leaves_nothing(tmp_path, first):
     run = Run(tmp_path / "run")
     run.begin(OPTIONS)
-    if made:
-        run.stage("train").finish({})
-    run.drop_if_empty()
-    assert run.folder.exists() == made
+    for each in (run, first):
+        each.drop_if_empty()
+        assert each.folder.exists() == (each is first)

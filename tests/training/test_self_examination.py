@@ -50,7 +50,6 @@ def of_pairs():
 
 @pytest.mark.parametrize("algorithm", ["ppo", "reinforce"])
 def test_a_policy_learns_what_the_reward_model_likes(algorithm):
-    """One action's share rises from about a sixth; the true reward is 0."""
     chosen = config(algorithm=algorithm, iterations=3, **TEACH)
     history = self_examine(make_env(likes(1), 32), *make_networks(), chosen, seed=0)
     assert history[0]["learned_reward"] < 0.35
@@ -81,14 +80,9 @@ def test_value_warm_up_leaves_the_policy_as_it_was():
 
 
 def test_the_callback_runs_when_due_and_at_the_end():
-    called = []
-    history = self_examine(
-        make_env(),
-        *make_networks(),
-        config(iterations=3, evaluate_every=2),
-        seed=0,
-        callback=lambda done: called.append(done) or {"success": torch.tensor(0.5)},
-    )
+    called, chosen = [], config(iterations=3, evaluate_every=2)
+    measure = lambda done: called.append(done) or {"success": torch.tensor(0.5)}  # noqa: E731
+    history = self_examine(make_env(), *make_networks(), chosen, seed=0, callback=measure)
     assert called == [2, 3]
     assert [metrics.get("success") for metrics in history] == [None, 0.5, 0.5]
 
@@ -105,7 +99,6 @@ def test_values_are_estimated_some_at_a_time_with_the_same_result(monkeypatch):
 
 @pytest.mark.parametrize(("make", "anew"), [(grouped, True), (of_pairs, False)])
 def test_a_killed_run_continues_to_the_same_weights(tmp_path, make, anew):
-    """In a notebook with the same objects: then they are no longer as they were at first."""
     chosen = config(iterations=3, select_every=1, select_episodes=8, max_steps=2)
     whole = make_networks()
     expected = self_examine(make(), *whole, chosen, seed=0)
@@ -145,9 +138,7 @@ def test_starts_inside_of_workers_are_refused():
 
 
 def test_no_true_reward_reaches_the_learner():
-    """The simulator would pay for success; what is learned from does not even hold that entry."""
-    seen = []
-    model = make_reward_model(Shapes((3, 48, 48), 64, tile_size=8), features=16, seed=0)
+    seen, model = [], make_reward_model(Shapes((3, 48, 48), 64, tile_size=8), features=16, seed=0)
 
     class Spy(AdversarialUpdates):
         def __call__(self, batch):
@@ -165,6 +156,14 @@ def instructed():
     return PickAndPlaceEnv("move", 4, seed=0)
 
 
+def of_gymnasium():
+    return GymEnv("ifo_grounding/Move-v0", categorical_action_encoding=True)
+
+
+def unpaid():
+    return TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL))
+
+
 @pytest.mark.parametrize(
     ("make", "error"),
     [
@@ -172,17 +171,9 @@ def instructed():
         (lambda: SerialEnv(2, lambda: simulator(4, expose_state=True)), "never sees the true sta"),
         (instructed, "never sees true instructions"),
         (lambda: SerialEnv(2, instructed), "never sees true instructions"),
-        (
-            lambda: SerialEnv(
-                2, lambda: GymEnv("ifo_grounding/Move-v0", categorical_action_encoding=True)
-            ),
-            "never sees true instructions",
-        ),
+        (lambda: SerialEnv(2, of_gymnasium), "never sees true instructions"),
         (simulator, "no instructions"),
-        (
-            lambda: TransformedEnv(simulator(), InstructionSampler(accepts_all(), POOL)),
-            "no learned reward",
-        ),
+        (unpaid, "no learned reward"),
     ],
 )
 def test_envs_that_leak_or_lack_something_are_refused(make, error):

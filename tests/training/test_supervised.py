@@ -146,16 +146,13 @@ def suitability(policy):
     return InstructionLoss(network, words, removal_rate=0.0)
 
 
-def test_only_losses_are_minimised():
+def test_only_losses_are_minimised_and_only_buffers_sampled():
     losses = TensorDict({"loss_a": torch.tensor(2.0), "loss_b": torch.tensor([1.0, 3.0])}, [])
     losses["accuracy"] = torch.tensor(100.0)
     assert total_loss(losses) == 4.0
     for none in (torch.ones(()), None, losses.select("accuracy")):
         with pytest.raises(UserError, match=r"entries named loss_\*, got (T|NoneT).* without"):
             total_loss(none)
-
-
-def test_what_cannot_be_sampled_is_refused():
     with pytest.raises(UserError, match="got list: demonstrations become one by labelled_buffer"):
         fit(torch.nn.Linear(1, 1), [1, 2], FitConfig(steps=1), seed=0)
 

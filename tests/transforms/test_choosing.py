@@ -50,11 +50,13 @@ def test_random_choice_does_not_prefer_the_best(candidates):
     assert ((chosen.bincount(minlength=10) - 300).abs() < 80).all()  # five standard errors
 
 
-def test_best_takes_the_highest_logit():
+def test_best_takes_the_highest_logit_and_nothing_of_no_states():
     model = classifier(network=lambda pixels, instruction: instruction[:, :1] * 1.0)
     choices = choose([0, 1], model, choose="best")
     assert choices.chosen.tolist() == [9, 9]
     assert choices.score.tolist() == pytest.approx([torch.tensor(10.0).sigmoid().item()] * 2)
+    none = choose([])
+    assert none.chosen.shape == (0,) and none.score.shape == (0,)
 
 
 def test_threshold_is_on_the_probability():
@@ -65,11 +67,8 @@ def test_threshold_is_on_the_probability():
 
 
 def test_inputs_in_the_other_order_are_understood():
-    model = TensorDictModule(
-        lambda instruction, pixels: Suitability().eval()(pixels, instruction),
-        ["instruction", "pixels"],
-        ["suitability"],
-    )
+    score = lambda instruction, pixels: Suitability().eval()(pixels, instruction)  # noqa: E731
+    model = TensorDictModule(score, ["instruction", "pixels"], ["suitability"])
     assert choose([8, 9], model).chosen.tolist() == [9, -1]
 
 
@@ -128,11 +127,6 @@ def test_candidates_are_distinct_and_uniform():
     for place in index.T:
         assert ((place.bincount(minlength=20) - 150).abs() < 60).all()  # five standard errors
     assert draw_candidates(2, 3, 6, None).sort(1).values.tolist() == [[0, 1, 2], [0, 1, 2]]
-
-
-def test_no_states_no_choices():
-    choices = choose([])
-    assert choices.chosen.shape == (0,) and choices.score.shape == (0,)
 
 
 @pytest.mark.parametrize(

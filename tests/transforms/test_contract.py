@@ -21,13 +21,9 @@ from transforms.counter_world import (
     shown,
 )
 
-PAIRS = TensorDict(  # number shown by scene n: 7 n mod 10; the instruction asks for one more
-    {
-        "scene": torch.arange(20).unsqueeze(-1),
-        "instruction": torch.stack([POOL[(n * 7 % 10 + 1) % 10] for n in range(20)]),
-    },
-    [20],
-)
+# Number shown by scene n: 7 n mod 10; the instruction asks for one more.
+ASKED = torch.stack([POOL[(n * 7 % 10 + 1) % 10] for n in range(20)])
+PAIRS = TensorDict({"scene": torch.arange(20).unsqueeze(-1), "instruction": ASKED}, [20])
 
 
 def sampler(nested=False):
@@ -161,18 +157,10 @@ def test_on_a_replay_buffer():
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=10)
     for transform in (sampler(), LearnedReward(reward_model())):
         buffer.append_transform(transform)
-    buffer.extend(
-        TensorDict(
-            {
-                "pixels": torch.zeros(50, 3, 8, 8, dtype=torch.uint8),
-                "action": torch.zeros(50).long(),
-            },
-            [50],
-        )
-    )
+    pixels = torch.zeros(50, 3, 8, 8, dtype=torch.uint8)
+    buffer.extend(TensorDict({"pixels": pixels, "action": torch.zeros(50).long()}, [50]))
     assert torch.allclose(buffer.sample()["next", "learned_reward"], torch.tensor(2.0).sigmoid())
-    stored = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(9), batch_size=9, transform=StartingPairs(PAIRS)
-    )
+    stored = TensorDictReplayBuffer(storage=LazyTensorStorage(9), batch_size=9)
+    stored.append_transform(StartingPairs(PAIRS))
     stored.extend(TensorDict({"pixels": torch.ones(9, 3)}, [9]))
     assert set(stored.sample().keys()) == {"pixels", "index"}

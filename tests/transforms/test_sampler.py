@@ -108,7 +108,7 @@ def test_mode_of_the_classifier_is_left_alone():
     assert not model.training
 
 
-def test_environments_that_show_their_state_are_refused():
+def test_environments_that_show_their_state_or_instruct_are_refused():
     for world in (
         CounterWorld((2,), expose_state=True),
         PickAndPlaceEnv("move", num_envs=2, instructed=False, expose_state=True),
@@ -116,14 +116,8 @@ def test_environments_that_show_their_state_are_refused():
     ):
         with pytest.raises(UserError, match="exposes its true state"):
             make(world=world).reset()
-
-
-def test_workers_with_carried_entries_are_no_exposed_state():
-    world = SerialEnv(2, lambda: TransformedEnv(CounterWorld((2,)), StepCounter()))
-    assert suits(make(world=world).reset()).all()
-
-
-def test_instructed_environments_are_refused():
+    carried = SerialEnv(2, lambda: TransformedEnv(CounterWorld((2,)), StepCounter()))
+    assert suits(make(world=carried).reset()).all()
     with pytest.raises(UserError, match="already writes 'instruction'"):
         make(world=CounterWorld((2,), instructed=True)).reset()
 
@@ -145,14 +139,11 @@ def test_called_on_states_it_chooses_for_each():
     assert suits(sampler(kept)).all()
 
 
-def test_another_classifier_may_take_the_place_of_the_first():
+def test_nothing_suitable_is_one_clear_line():
     env = make(max_tries=2)
-    env.transform.classifier = constant(-9.0)
+    env.transform.classifier = constant(-9.0)  # another one takes the place of the first
     with pytest.raises(NothingSuitableError):
         env.reset()
-
-
-def test_nothing_suitable_is_one_clear_line():
     world = CounterWorld((3,))
     with pytest.raises(NothingSuitableError) as caught:
         make(world=world, model=constant(0.532), max_tries=7).reset()
