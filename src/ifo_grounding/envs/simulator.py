@@ -165,11 +165,11 @@ class Simulator:
         ahead lies at its number modulo their count.
         """
         on_cpu = self.device.type == "cpu"
-        count = max(FEWEST, self.num_envs * (2 if on_cpu else AHEAD))
+        count = max(4 * FEWEST, self.num_envs * (2 if on_cpu else AHEAD))
         if on_cpu or self._most + self.num_envs > self._drawn:
             self._most = int(self._next)
         if self._most + self.num_envs > self._drawn:
-            end = self._most + count
+            end = self._most + (count if self._ahead else max(FEWEST, self.num_envs))
             for part in torch.arange(self._drawn, end, device=self.device).split(CHUNK):
                 drawn = leaves(draw_scenes(self.stream.options, self.stream.seed, part))
                 if not self._ahead:

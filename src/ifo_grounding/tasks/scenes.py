@@ -114,6 +114,9 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
         UserError: where hardly any scene has a suitable goal.
     """
     key = derive(seed, "scenes", options.stream)
+    if not options.instructed:
+        lots = Lots(key, numbers, torch.zeros_like(numbers))
+        return _unasked(random_layout(lots, options.shown_layout))
     left = torch.arange(len(numbers), device=numbers.device)
     width = max(len(left), FEWEST)
     found: list[Any] = []
@@ -137,12 +140,16 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
         left, tried, drawn = left[~has], tried + times, drawn + len(lots)
     every: Any = torch.cat(found)
     every = every[torch.cat(places).argsort()]
-    if options.instructed:
-        wanted, said = every.wanted, grammar(options.task).encode(every.goal, every.wording)
-    else:
-        wanted = torch.zeros_like(every.wanted)
-        said = every.wording.new_zeros(len(every), VOCABULARY.length)
-    return Scene(every.state, wanted, said, batch_size=every.batch_size)
+    said = grammar(options.task).encode(every.goal, every.wording)
+    return Scene(every.state, every.wanted, said, batch_size=every.batch_size)
+
+
+def _unasked(state: WorldState) -> Scene:
+    """Return scenes in which nothing is asked: plans and words of zeros."""
+    nothing, shape = torch.zeros_like(state.arm), state.batch_size
+    cells, words = torch.zeros_like(state.objects), nothing.new_zeros(*shape, VOCABULARY.length)
+    wanted = Plan(nothing, nothing, nothing, nothing.bool(), cells, nothing, batch_size=shape)
+    return Scene(state, wanted, words, batch_size=shape)
 
 
 def _propose(options: SceneOptions, lots: Lots) -> tuple[_Proposal, Tensor]:
@@ -151,8 +158,6 @@ def _propose(options: SceneOptions, lots: Lots) -> tuple[_Proposal, Tensor]:
     goal = propose_goal(state, check_task(options.task), lots)
     wanted = plan(state, goal, options.max_steps)
     good = (wanted.verdict == SUITABLE) & in_split(goal, options.split, options.holdout)
-    if not options.instructed:
-        good = torch.ones_like(good)
     wording = lots.below(len(grammar(options.task).phrasings)).squeeze(-1)
     return _Proposal(state, wanted, goal, wording, batch_size=[len(lots)]), good
 
