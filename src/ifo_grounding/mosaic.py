@@ -6,6 +6,7 @@ tiles and permuting them afterwards.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -69,22 +70,39 @@ def _laid(planes: Tensor, index: Tensor, width: int) -> Tensor:
     return planes.expand(*shape[:4], -1).gather(4, places.expand(shape)).view(torch.uint8)
 
 
-def lay(pixels: Tensor, table: Tensor, places: tuple[Tensor, ...], tiles: Tensor) -> None:
+def lay(pixels: Tensor, table: Tensor, places: Tensor, tiles: Tensor) -> None:
     """Lay tiles at some places of pictures that :func:`assemble` made.
 
     Args:
         pixels: uint8 [N, C, rows * T, columns * T], written to.
         table: tiles as :func:`as_words`, int64 [K, C, T, W].
-        places: picture, row and column of each, int64 [M].
+        places: where, each once: picture, row and column as one number, int64 [M].
         tiles: which, integer [M].
 
     >>> table = as_words(torch.arange(2, dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 8, 8))
     >>> pixels = assemble(table, torch.tensor([[[0, 0]]]))
-    >>> lay(pixels, table, torch.tensor([[0], [0], [1]]).unbind(), torch.tensor([1]))
+    >>> lay(pixels, table, torch.tensor([1]), torch.tensor([1]))
     >>> pixels[0, 0, 0].tolist()
     [0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]
     """
-    size, width = table.shape[2:]
-    laid = pixels.view(torch.int64).unflatten(-1, (-1, width)).unflatten(-3, (-1, size))
-    laid = laid.permute(0, 2, 4, 1, 3, 5)  # [N, rows, columns, C, T, W]
-    laid[places] = table.index_select(0, tiles.long())
+    rows, columns = (side // table.shape[2] for side in pixels.shape[-2:])
+    first, rest = _words_of_tiles(*table.shape[1:], rows, columns, str(pixels.device))
+    picture = places.div(len(first), rounding_mode="floor")
+    begin = first.index_select(0, places - picture * len(first))
+    begin.add_(picture, alpha=len(first) * len(rest))
+    drawn = table.flatten(1).index_select(0, tiles.long()).view(-1)
+    index, words = (begin.unsqueeze(-1) + rest).view(-1), pixels.view(torch.int64).view(-1)
+    if torch.are_deterministic_algorithms_enabled():  # put_ is none of them, and faster
+        words.scatter_(0, index, drawn)
+    else:
+        words.put_(index, drawn)
+
+
+@functools.cache
+def _words_of_tiles(
+    channels: int, size: int, width: int, rows: int, columns: int, device: str
+) -> tuple[Tensor, Tensor]:
+    """Return the first word of each place of a picture, and where a tile's words follow it."""
+    words = torch.arange(channels * rows * size * columns * width, device=device)
+    words = words.view(channels, rows, size, columns, width)
+    return words[0, :, 0, :, 0].flatten(), words[:, 0, :, 0].flatten()

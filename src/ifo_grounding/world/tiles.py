@@ -113,12 +113,13 @@ class Canvas:
             return mosaic.assemble(words, index)
         if self._shown.shape != index.shape:
             self._shown = torch.full_like(index, -1)  # all cells are new
-        changed = (index != self._shown).nonzero(as_tuple=True)
-        if MOST_CHANGED * len(changed[0]) > index.numel():
+        tiles = index.view(-1)
+        changed = tiles.ne(self._shown.view(-1)).nonzero().squeeze(-1)
+        if MOST_CHANGED * len(changed) > len(tiles):
             self._frames = mosaic.assemble(words, index)
         else:
             table = mosaic.as_words(tile_table(self.tile_size))
-            mosaic.lay(self._frames, table, changed, index[changed])
+            mosaic.lay(self._frames, table, changed, tiles.index_select(0, changed))
         self._shown = index
         return self._frames.clone()
 
