@@ -140,6 +140,7 @@ def test_no_goal_needs_more_steps_than_an_episode_has():
         ({"stream": "x"}, "unknown stream 'x'"),
         ({"holdout": "x"}, "unknown holdout 'x'"),
         ({"max_steps": 0}, "max_steps must be at least 1"),
+        ({"holdout_visible": "no"}, "unknown holdout_visible 'no'"),
         ({"layout": {"size": 8}}, "a layout is a Layout"),
         ({"task": "pick", "layout": Layout(boxes=(0, 0))}, "only 0 of .* admit a suitable goal"),
     ],

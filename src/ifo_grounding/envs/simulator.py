@@ -65,8 +65,6 @@ class Simulator:
         device: torch.device | str | None = None,
     ) -> None:
         check_choice("tile size", tile_size, TILE_SIZES)
-        for name in ("instructed", "holdout_visible"):
-            check_choice(name, getattr(options, name), (True, False))
         at_least_one("num_envs", num_envs)
         self.options, self.num_envs, self.tile_size = options, num_envs, tile_size
         self.device = torch.device(device or "cpu")

@@ -77,6 +77,8 @@ class SceneOptions:
 
     def __post_init__(self) -> None:
         check_task(self.task)
+        for name in ("instructed", "holdout_visible"):
+            check_choice(name, getattr(self, name), (True, False))
         if not isinstance(self.layout, Layout):
             raise UserError(
                 f"a layout is a Layout, such as Layout(size=8), got {type(self.layout).__name__}"
