@@ -1,17 +1,16 @@
 """Sets of demonstrations whose pixels are more than memory may hold."""
 
-import multiprocessing
 import pickle
+import subprocess
+import sys
 import threading
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
 
 from comparing import all_frames
-from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.data import (
     Demonstrations,
     _episodes,
@@ -31,7 +30,8 @@ def memory():
 
 def use_a_large_set(folder):
     """Build from a generator, save, load and sample; return bytes of pixels and of more memory."""
-    release_freed_memory()
+    _spool.PIECE_BYTES = _episodes.PIECE_BYTES = _spool.MEMORY_BYTES = 2 << 20
+    codec.PATIENCE_BYTES = 2 << 20
     peaks = [memory()]
 
     def watch():
@@ -50,13 +50,13 @@ def use_a_large_set(folder):
     return demos.codes.nbytes, max(peaks) - peaks[0]
 
 
-def test_pixels_of_a_large_set_are_not_held_in_memory(ifo_home, tmp_path, monkeypatch):
-    for module in (_spool, _episodes):
-        monkeypatch.setattr(module, "PIECE_BYTES", 2 << 20)
-    monkeypatch.setattr(_spool, "MEMORY_BYTES", 2 << 20)
-    monkeypatch.setattr(codec, "PATIENCE_BYTES", 2 << 20)
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as pool:
-        pixels, grown = pool.submit(use_a_large_set, tmp_path / "demos").result()
+def test_pixels_of_a_large_set_are_not_held_in_memory(ifo_home, tmp_path):
+    """In a new process: a forked one would inherit what other tests left free or keep."""
+    program = f"import sys; sys.path[:0] = {sys.path!r}; from data.test_large import *"
+    program += "; print(*use_a_large_set(sys.argv[1]))"
+    command = [sys.executable, "-c", program, str(tmp_path / "demos")]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    pixels, grown = map(int, done.stdout.splitlines()[-1].split())
     assert pixels > 120 << 20
     assert grown < pixels / 2, f"{grown} bytes of memory for {pixels} bytes of pixels"
     assert not list(ifo_home.iterdir())
