@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import torchrl  # noqa: F401  (sets variables of the environment when it is first imported)
 
 from ifo_grounding import cli
 from ifo_grounding.cli import recipe_names, recipes_folder

@@ -209,7 +209,9 @@ def _refuse_unknown(cfg: DictConfig) -> None:
 
 def explained(error: Exception) -> UserError:
     """Return what was wrong with options, what was given and what is allowed, in one line."""
-    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    cause = error
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        cause = error.__cause__  # that of an error of OmegaConf is another one under a debugger
     if isinstance(error, MissingConfigException) and error.options:
         group, _, given = str(error.missing_cfg_file).rpartition("/")
         allowed = [name for name in error.options if not name.endswith("Options")]

@@ -21,9 +21,9 @@ _told: list[str] = []
 
 def tell_progress(stage: str) -> None:
     """Tell from now on how far a stage is."""
-    if not _told and not sys.stderr.isatty():
+    began, _told[:] = bool(_told), [stage]
+    if not began and not sys.stderr.isatty():
         threading.Thread(target=_tell, args=(time.monotonic(),), daemon=True).start()
-    _told[:] = [stage]
 
 
 def progress_bar(*args: Any, shown: bool | None = None, **options: Any) -> Any:
@@ -40,5 +40,5 @@ def _tell(begun: float) -> None:
         time.sleep(EVERY)
         bars = sorted(getattr(tqdm, "_instances", ()), key=lambda one: one.start_t)
         parts = [tqdm.format_meter(**{**one.format_dict, "bar_format": LINE}) for one in bars]
-        now = f"{_told[0]}: running ({time.monotonic() - begun:,.0f} s since the start)"
+        now = f"{''.join(_told)}: running ({time.monotonic() - begun:,.0f} s since the start)"
         print("; ".join([now, *parts]), file=sys.stderr, flush=True)
