@@ -32,7 +32,7 @@ from ifo_grounding.report import (
     training_curves,
     write_report,
 )
-from ifo_grounding.report.results import conclusion, meaning, restored, unpacked
+from ifo_grounding.report.results import conclusion, headline, meaning, restored, unpacked
 from ifo_grounding.stats import Rate
 from ifo_grounding.training import Run
 
@@ -64,7 +64,7 @@ AUDIT = {
     "Entropy of the policy": {"entropy": "nats"},
 }
 """Reward hacking shows in the first panel: the learned return rises, and true success does not."""
-EPISODES, TRACED = 4, 2
+EPISODES, COMPARED, TRACED = 4, 3, 2
 TILE_SIZE = 32
 """Of a cell in animations, for people."""
 
@@ -94,11 +94,11 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     rows = [{**row, "means": meaning(row["measured"])} for row in results_rows(results)]
     return write_report(
         run / "report",
-        {"Results": rows, "Made by": made_by(run)},
+        {**headline(results), "All that was measured": rows, "How it was made": made_by(run)},
         pictures,
-        title=f"{options.task}, preset {options.preset}",
-        summary=f"{conclusion(results)} {options.demonstrations.n:,} demonstrations, seed "
-        f"{options.seed}, {section.episodes:,} evaluation scenes ({scenes}).",
+        title=f"{options.task}, {options.demonstrations.n:,} demonstrations",
+        summary=f"{conclusion(results)} Preset {options.preset}, seed {options.seed}, "
+        f"{section.episodes:,} scenes ({scenes}).",
     )
 
 
@@ -119,29 +119,29 @@ def recorded(policy: Any, scenes: list[int], options: Options, tile_size: int | 
 
 
 def episode_pictures(run: Run, options: Options, results: dict[str, Any]) -> dict[str, Any]:
-    """Animate episodes: scenes that phase 2 gained and lost, or some of phase 1."""
-    found: dict[str, Any] = {}
+    """Animate episodes: scenes that phase 2 gained and lost, or some of the last policy."""
     names = [name for name in POLICIES if name in results]
     policies = [load_network(run, POLICIES[name], "imitate", options) for name in names]
     drawn = {"actions": world_of(options).actions}
     episodes = recorded(policies[-1], list(range(EPISODES)), options, TILE_SIZE)
-    found[f"Episodes of phase {len(policies)}"] = animation(episodes, columns=EPISODES, **drawn)
+    some = {f"Episodes of phase {len(policies)}": animation(episodes, columns=EPISODES, **drawn)}
     if len(policies) == 1 or results[names[0]]["mode"] != "greedy":
         # Actions that were drawn are not drawn again: what they solved, these episodes may not.
-        return found | step_by_step(policies[-1], list(range(TRACED)), run, options)
+        return some | step_by_step(policies[-1], list(range(TRACED)), run, options)
     before, after = (torch.from_numpy(unpacked([{"results": results}], name)[0]) for name in names)
+    found: dict[str, Any] = {}
     for title, changed in {
-        "Solved by phase 2 alone": after & ~before,
-        "Solved by phase 1 alone": before & ~after,
+        "Before and after self-examination": after & ~before,
+        "Solved before, and not after": before & ~after,
     }.items():
-        scenes = changed.nonzero().squeeze(-1)[:EPISODES].tolist()
+        scenes = changed.nonzero().squeeze(-1)[:COMPARED].tolist()
         if scenes:
             tries = [recorded(policy, scenes, options, TILE_SIZE) for policy in policies]
-            titles = [f"phase {phase}" for phase in (1, 2) for _ in scenes]
-            both = [*tries[0], *tries[1]]
-            found[title] = animation(both, titles=titles, columns=len(scenes), **drawn)
+            both = [one for pair in zip(*tries, strict=True) for one in pair]
+            titles = ["imitation", "self-examination"] * len(scenes)
+            found[title] = animation(both, titles=titles, columns=len(policies), **drawn)
     improved = (after & ~before).nonzero().squeeze(-1)[:TRACED].tolist()
-    return found | step_by_step(policies[1], improved or list(range(TRACED)), run, options)
+    return found | some | step_by_step(policies[1], improved or list(range(TRACED)), run, options)
 
 
 def step_by_step(policy: Any, scenes: list[int], run: Run, options: Options) -> dict[str, bytes]:

@@ -23,7 +23,8 @@ from ifo_grounding.attributes import untransformed
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import STAGES, Options
 from ifo_grounding.envs import GymnasiumEnv
-from ifo_grounding.report import results_table
+from ifo_grounding.report import text_table
+from ifo_grounding.report.results import conclusion, headline
 from report import report
 
 
@@ -77,7 +78,8 @@ def stages_of(options: Options) -> dict[str, Callable[[Options], dict]]:
 def main(options: Options) -> dict:
     results = two_phase(options)
     page = report(options, results)
-    print(f"\n{results_table(results)}\n\nrun: {open_run(options).folder}\nreport: {page}")
+    table = [{"in unseen scenes": k, "[95% interval]": v} for k, v in headline(results).items()]
+    print(f"\n{text_table(table)}\n\n{conclusion(results)}\nreport: {page}")
     return results
 
 

@@ -31,6 +31,12 @@ def main(options):
         raise KeyboardInterrupt
     if options.task == "end":
         os.kill(os.getpid(), signal.SIGTERM)
+    if options.task == "within":
+        import torch
+        from tensordict import TensorDict
+        layer = torch.nn.Linear(1, 1)
+        with TensorDict.from_module(layer).to_module(layer):
+            raise KeyboardInterrupt
     if options.task == "measure":
         import torch
         from ifo_grounding.report.results import by_scene
@@ -118,7 +124,7 @@ def test_results_of_several_seeds_end_in_one_table(recipes, capsys):
     assert paper.split()[:3] == ["measure-paper-demo-seed*", "2", "70.0%"]
 
 
-@pytest.mark.parametrize("task", ["interrupt", "end"])
+@pytest.mark.parametrize("task", ["interrupt", "end", "within"])
 def test_an_interruption_is_no_mistake(recipes, capsys, task):
     assert run("run", "greet", f"task={task}") == 130
     assert capsys.readouterr().err == "interrupted\n"

@@ -47,7 +47,10 @@ def one_line_errors() -> Iterator[None]:
             raise
         print("error:", " ".join(str(error).split()), file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, RuntimeError) as error:
+        # Within tensordict's `with params.to_module(...)` an interruption becomes a RuntimeError.
+        if KeyboardInterrupt not in (type(error), type(error.__context__)):
+            raise
         print("interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
 

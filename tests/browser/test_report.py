@@ -61,6 +61,7 @@ def opened(request, browser, page_of_a_run):
     page.on("console", lambda message: page.complaints.append(message.text))
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
     page.goto(page_of_a_run.as_uri())
+    page.evaluate("document.querySelectorAll('details').forEach(part => part.open = true)")
     page.wait_for_function("[...document.images].every(image => image.complete)")
     yield page
     context.close()
@@ -74,7 +75,12 @@ def test_it_needs_no_network_and_shows_every_picture(opened, page_of_a_run):
     assert len(widths) >= 10
     assert min(widths) > 0
     headings = opened.locator("h2").all_inner_texts()
-    for heading in ("Results", "Step by step, scene 0", "Chosen instructions", "Self-examination"):
+    for heading in (
+        "All that was measured",
+        "Step by step, scene 0",
+        "Chosen instructions",
+        "Self-examination",
+    ):
         assert heading in headings
 
 

@@ -36,14 +36,15 @@ def write_report(
 ) -> Path:
     """Write a folder with ``index.html``, ``results.json`` and ``pictures/``.
 
-    The page holds everything itself, so that it can be moved or sent alone. It adapts to phones and
-    to dark mode.
+    The first picture stands on top, then numbers; all else is folded away under its heading. The
+    page holds everything itself, so that it can be moved or sent alone. It adapts to phones and to
+    dark mode.
 
     Args:
         folder: where; other files in it are left alone.
         results: what was measured, by heading. A number or an interval
-            (:class:`~ifo_grounding.stats.Rate` and its like) becomes a headline on top; a mapping
-            a table of two columns, a list of mappings a table with a column per key, a text a
+            (:class:`~ifo_grounding.stats.Rate` and its like) is shown large; a mapping becomes a
+            table of two columns, a list of mappings a table with a column per key, a text a
             paragraph.
         pictures: by heading: matplotlib figures, the bytes of PNGs, GIFs or JPEGs, or lists of
             :class:`~ifo_grounding.report.Captioned`.
@@ -60,20 +61,24 @@ def write_report(
     ('index.html', ['index.html', 'results.json'])
     """
     folder, pictures = Path(folder), pictures or {}
-    cards, sections = [], []
+    cards, tables, shown = [], [], []
     for name, value in results.items():
         if is_number(value) and value is not None and not isinstance(value, bool):
             cards.append({"name": name, **_cell(value)})
         else:
-            sections.append({"name": name, **_result(value)})
+            tables.append({"name": name, **_result(value)})
     for number, (name, picture) in enumerate(pictures.items(), 1):
         file = "-".join([f"{number:02}", *re.findall("[a-z0-9]+", name.lower())])[:80]
-        sections.append({"name": name, **_picture(picture, folder / "pictures" / file)})
+        shown.append({"name": name, **_picture(picture, folder / "pictures" / file)})
     # Every text is escaped by the template: instructions and names come from users.
     loader = PackageLoader("ifo_grounding.report", "")
     pages = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     page = pages.get_template("page.html").render(
-        title=title, summary=summary, cards=cards, sections=sections
+        title=title,
+        summary=summary,
+        first=shown[0] if shown else None,
+        cards=cards,
+        sections=[*shown[1:], *tables],
     )
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "results.json", plain(results))

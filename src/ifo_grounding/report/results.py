@@ -90,17 +90,42 @@ def meaning(measured: str) -> str:
     return MEANINGS[max(name for name in MEANINGS if measured.startswith(name))]
 
 
+def headline(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what one looks for first: success of both phases, their difference, and suitability.
+
+    >>> from ifo_grounding.stats import wilson
+    >>> print(headline({"phase1": {"rate": wilson(9, 10).as_dict()}})["Imitation (phase 1)"])
+    90.0% [59.6, 98.2] (n=10)
+    """
+    rows = {
+        "Imitation (phase 1)": (Rate, results.get("phase1", {}).get("rate")),
+        "After self-examination (phase 2)": (Rate, results.get("phase2", {}).get("rate")),
+        "Difference": (Difference, results.get("gain")),
+        "Imitation continued": (Rate, results.get("continued", {}).get("rate")),
+        "Chosen instructions that suit": (Rate, (results.get("suitability") or {}).get("rate")),
+    }
+    return {name: restored(*row) for name, row in rows.items() if row[1] and row[1]["count"]}
+
+
 def conclusion(results: Mapping[str, Any]) -> str:
     """Return in one sentence what a run found; results as for :func:`results_rows`."""
-    names = [name for name in ("phase1", "phase2") if results.get(name)]
-    before, *after = (brief(restored(Rate, results[name]["rate"])) for name in names)
-    if not after:
-        return f"Phase 1 succeeds in {before} of the scenes; there is no phase 2."
+    found = list(headline(results).values())
+    before = percent(found[0])
+    if "phase2" not in results:
+        return f"Imitation does what it is told in {before} of the scenes; there is no phase 2."
     if results["phase2"] == results["phase1"]:
-        return f"No phase-2 checkpoint beat phase 1, which is reported: {before} of the scenes."
-    gain = restored(Difference, results["gain"])
-    chance = ", which may be chance" if gain.low <= 0 <= gain.high else ""
-    return f"Phase 2 gains {brief(gain)} points{chance}: from {before} of the scenes to {after[0]}."
+        return f"No checkpoint of phase 2 beat imitation, which is kept: {before} of the scenes."
+    after, gain = percent(found[1]), found[2]
+    chance = "; the difference may be chance" if gain.low <= 0 <= gain.high else ""
+    return (
+        f"Imitation does what it is told in {before} of unseen scenes; after practice on its own "
+        f"signals alone, the agent does in {after}{chance}."
+    )
+
+
+def percent(rate: Rate) -> str:
+    """Return a rate in percent, without its interval."""
+    return str(rate).partition(" ")[0]
 
 
 def seeds_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
