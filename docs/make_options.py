@@ -13,8 +13,8 @@ from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 PAGE = Path(__file__).with_name("options.md")
 HEAD = """# Options
 
-Written `name=value`, as [Recipes](recipes.md#options) shows. Values are those of `budget=demo`,
-`strong` / `paper` where these presets differ; `ifo-grounding demo budget=few --help` shows others.
+Written `name=value`, as [Run and resume](recipes.md#options) shows. Values are those of `budget=demo`, `strong` / `paper`
+where these presets differ; `ifo-grounding demo budget=few --help` shows others.
 """
 SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
 WORLDS = {"world=grid": Grid, "world=babyai": BabyAI, "world=gymnasium": Gymnasium}
@@ -29,7 +29,7 @@ def page() -> str:
     general = [f.name for f in fields(Options) if f.name not in (*SECTIONS, "world")]
     learning = [*field_docs(FitConfig)]
     said = f"Each in {', '.join(f'`{name}`' for name in FITTED)}, such as `imitate.lr`."
-    parts = [HEAD, "## General\n", table(Options, general, "", value=presets)]
+    parts = [HEAD, "## General\n", listed(Options, general, "", presets)]
     parts += [f"## How networks learn\n\n{said}\n"]
     parts += [table(FitConfig, learning, "", **{name: values[name] for name in FITTED})]
     for name, kind in {**SECTIONS, **WORLDS}.items():
@@ -37,8 +37,14 @@ def page() -> str:
         if own := [n for n in field_docs(kind) if name not in FITTED or n not in learning]:
             said = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("``", "`")
             parts += [f"## {name}\n\n{said}\n"]
-            parts += [table(kind, own, f"{name.partition('=')[0]}.", value=shown)]
+            parts += [listed(kind, own, f"{name.partition('=')[0]}.", shown)]
     return "\n".join(parts)
+
+
+def listed(kind: type, names: list[str], above: str, values: list) -> str:
+    """Return a line for each option, which a narrow screen can break."""
+    docs = field_docs(kind)
+    return "".join(f"- **`{above}{n}`** = {shown(values, n)}: {docs[n]}\n" for n in names)
 
 
 def table(kind: type, names: list[str], above: str, **columns: list) -> str:
