@@ -70,7 +70,10 @@ def on_device(rows: dict[str, dict[str, Any]]) -> str:
     rates = [rate_row(row) for row in rows.values() if row["rates"]]
     facts = [fact_row(row) for row in rows.values() if row["facts"]]
     parts += [markdown_table(part) for part in (rates[:7], rates[7:], facts) if part]
-    notes = [f"- {row['name']}: {row['note']}." for row in rows.values() if row["note"]]
+    of_note: dict[str, list[str]] = {}
+    for row in rows.values():
+        of_note.setdefault(row["note"], []).append(row["name"])
+    notes = [f"- {'; '.join(names)}: {note}." for note, names in of_note.items() if note]
     return "\n\n".join([*parts, "\n".join(notes)])
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import re
+import runpy
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,18 +22,22 @@ from ifo_grounding.networks import (
     make_reward_model,
     make_value,
 )
-from ifo_grounding.options import MULTIRUN, options_of_jobs
+from ifo_grounding.options import MULTIRUN, options_of, options_of_jobs
 from ifo_grounding.tasks import grammar
 from ifo_grounding.training import SelfExaminationConfig, self_examine
 from ifo_grounding.training.self_examination import ALGORITHMS
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
+from importing import recipes_importable
 from objectives.conftest import LOSSES, make_loss
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS]
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+TITLED = re.compile(r'^```python title="([\w.]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 LONGEST = 250
+MOST_WORDS = 25_000
+SLOW = ("budget=", "threads=", "instruction.", "imitate.", "self_examine.", "evaluate.")
 NOT_EXECUTED = "<!-- not executed -->\n"
 
 
@@ -54,13 +60,41 @@ def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
     """All blocks of a page run one after the other, in a folder of their own, as a reader would."""
     if page.name == "own-frames.md":
         pytest.importorskip("minari", reason="the extra minari needs Python 3.11")
-    monkeypatch.chdir(tmp_path)
+    save_files(monkeypatch, tmp_path, page, ROOT / "docs" / "index.md")
     torch.manual_seed(0)
     namespace: dict[str, object] = {"__name__": "__main__"}
     for line, code in blocks(page, "python"):
         code = re.sub(r"\bsteps=\d\d+", "steps=8", code)  # to run through is enough
         # Leading newlines make a traceback point at the line of the page.
         exec(compile("\n" * (line - 1) + code, str(page), "exec"), namespace)
+
+
+def save_files(monkeypatch, folder: Path, *pages: Path) -> None:
+    """Go to a folder that has the files which pages ask their readers to save."""
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    for name, code in (found.groups() for page in pages for found in TITLED.finditer(page.read_text())):
+        (folder / name).write_text(code)
+        monkeypatch.delitem(sys.modules, Path(name).stem, raising=False)
+
+
+def test_start_ends_with_a_policy_of_the_readers_own_world(tmp_path, monkeypatch, capsys):
+    """Its files and commands as they stand there, with a budget of seconds."""
+    start = ROOT / "docs" / "index.md"
+    save_files(monkeypatch, tmp_path, start)
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path / "home"))
+    asked = [words for page, words in commands("python", "ifo-grounding") if page == name_of(start)]
+    assert asked[0] == ["python", "dial.py"]
+    runpy.run_path("dial.py", run_name="__main__")
+    given = [word for word in asked[1][2:] if not word.startswith(SLOW)]
+    assert asked[1][:2] == ["ifo-grounding", "demo"]
+    assert {"world.factory=dial.Dial", "recorded=shown", "run=dial"} <= set(given)
+    with recipes_importable():
+        from two_phase import two_phase
+
+        two_phase(options_of(*given, "budget=tiny", "threads=1", "progress=false"))
+    runpy.run_path("ask.py")
+    assert "tensor(" in capsys.readouterr().out
 
 
 def commands(*starts: str) -> list[tuple[str, list[str]]]:
@@ -100,6 +134,10 @@ def test_the_page_of_options_is_up_to_date(monkeypatch):
     import make_options
 
     assert make_options.PAGE.read_text() == make_options.page()
+
+
+def test_the_documentation_can_be_read_to_the_end():
+    assert sum(len(page.read_text().split()) for page in DOCS) <= MOST_WORDS
 
 
 def test_no_page_is_long():
