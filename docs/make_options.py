@@ -13,8 +13,9 @@ from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 PAGE = Path(__file__).with_name("options.md")
 HEAD = """# Options
 
-Written `name=value`, as [Run and resume](recipes.md#options) shows. Values are those of `budget=demo`, `strong` / `paper`
-where these presets differ; `ifo-grounding demo budget=few --help` shows others.
+Written `name=value`, as [Run and resume](recipes.md#options) shows. Values are those of
+`budget=demo`, `strong` / `paper` where these presets differ; `ifo-grounding demo budget=few --help`
+shows others.
 """
 SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
 WORLDS = {"world=grid": Grid, "world=babyai": BabyAI, "world=gymnasium": Gymnasium}

@@ -73,7 +73,7 @@ def save_files(monkeypatch, folder: Path, *pages: Path) -> None:
     """Go to a folder that has the files which pages ask their readers to save."""
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(folder)
-    for name, code in (found.groups() for page in pages for found in TITLED.finditer(page.read_text())):
+    for name, code in TITLED.findall("\n".join(page.read_text() for page in pages)):
         (folder / name).write_text(code)
         monkeypatch.delitem(sys.modules, Path(name).stem, raising=False)
 
