@@ -1,36 +1,34 @@
-"""Write the page of all options: ``python docs/make_options.py`` after one has changed."""
+"""The page of all options, which MkDocs completes as it builds: a hook of ``mkdocs.yml``."""
 
 import inspect
 from dataclasses import fields, is_dataclass, replace
-from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 from ifo_grounding.config import Options
 from ifo_grounding.options import field_docs, options_of, written
 from ifo_grounding.training import FitConfig
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
-PAGE = Path(__file__).with_name("options.md")
-HEAD = """# Options
-
-Written `name=value`, as [Run and resume](recipes.md#options) shows. Values are those of
-`budget=demo`, `strong` / `paper` where these presets differ; `ifo-grounding demo budget=few --help`
-shows others.
-"""
 SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
 WORLDS = {"world=grid": Grid, "world=babyai": BabyAI, "world=gymnasium": Gymnasium}
 FITTED = [name for name, kind in SECTIONS.items() if issubclass(kind, FitConfig)]
 
 
-def page() -> str:
-    """Return the page as Markdown."""
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Called by MkDocs for each page."""
+    return f"{markdown}\n{described()}" if page.file.src_uri == "options.md" else markdown
+
+
+def described() -> str:
+    """Return every option with its value and meaning, as Markdown."""
     composed = (options_of(f"preset={name}") for name in ("strong", "paper"))
     presets = [replace(each, run=Options.run) for each in composed]
     values = {name: [getattr(each, name) for each in presets] for name in SECTIONS}
     general = [f.name for f in fields(Options) if f.name not in (*SECTIONS, "world")]
     learning = [*field_docs(FitConfig)]
     said = f"Each in {', '.join(f'`{name}`' for name in FITTED)}, such as `imitate.lr`."
-    parts = [HEAD, "## General\n", listed(Options, general, "", presets)]
+    parts = ["## General\n", listed(Options, general, "", presets)]
     parts += [f"## How networks learn\n\n{said}\n"]
     parts += [table(FitConfig, learning, "", **{name: values[name] for name in FITTED})]
     for name, kind in {**SECTIONS, **WORLDS}.items():
@@ -58,7 +56,3 @@ def table(kind: type, names: list[str], above: str, **columns: list) -> str:
 def shown(values: list, name: str) -> str:
     texts = dict.fromkeys(written(getattr(each, name)) for each in values)
     return " / ".join(f"`{text}`" for text in texts)
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page())
