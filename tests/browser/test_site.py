@@ -14,7 +14,7 @@ from playwright.sync_api import sync_playwright
 
 from test_docs import ROOT
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.timeout(1200)]
 
 FLAGS = ["--no-sandbox", "--disable-background-networking", "--disable-component-update"]
 SCREENS = {"desktop": (1280, 900), "phone": (390, 844)}
