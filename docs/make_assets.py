@@ -1,6 +1,7 @@
 """Draw the pictures of the README: ``python docs/make_assets.py RUN`` after a demo run.
 
-``world.png`` shows a scene of each task; ``agent.gif`` the policy of that run (a name or a path).
+``world.png`` shows a scene of each task; ``before-after.gif`` what phase 2 of that run (a name
+or a path) has mended.
 """
 
 import sys
@@ -10,14 +11,13 @@ from pages import write
 
 from ifo_grounding import networks
 from ifo_grounding.evaluation import record_episodes
-from ifo_grounding.files import read_json
 from ifo_grounding.report import Captioned, animation, gallery
 from ifo_grounding.report.theme import GOOD
 from ifo_grounding.tasks import TASKS, VOCABULARY, SceneOptions, SceneStream
 from ifo_grounding.training import Run
 from ifo_grounding.world import render
 
-SCENES = range(4)
+SCENES, TRIED = 4, 60
 
 
 def world() -> bytes:
@@ -31,14 +31,22 @@ def world() -> bytes:
     return gallery(cases, columns=len(cases))
 
 
-def agent(run: Run) -> bytes:
-    policy = networks.load(run.need("policy-phase2.safetensors", "two_phase"))
-    task = read_json(run.need("options.json", "two_phase"))["task"]
-    shown = record_episodes(policy, task, SCENES, stream="validation", render_tile_size=32)
-    return animation(shown, columns=len(SCENES), width=180)
+def before_and_after(run: Run) -> bytes:
+    """Show scenes in which the policy of phase 1 fails and that of phase 2 does not."""
+    task = (run.options() or {})["task"]
+    tries = []
+    for phase in (1, 2):
+        policy = networks.load(run.need(f"policy-phase{phase}.safetensors", "two_phase"))
+        shown = {"stream": "validation", "render_tile_size": 32}
+        tries.append(record_episodes(policy, task, range(TRIED), **shown))
+    pairs = [pair for pair in zip(*tries, strict=True) if pair[1].success > pair[0].success]
+    both = [episode for phase in zip(*pairs[:SCENES], strict=True) for episode in phase]
+    titles = [title for title in ("imitation", "after practice") for _ in range(SCENES)]
+    return animation(both, titles=titles, columns=SCENES, width=180)
 
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         raise SystemExit("usage: python docs/make_assets.py RUN")
-    write({}, {"world.png": world(), "agent.gif": agent(Run(sys.argv[1]))})
+    pictures = {"world.png": world(), "before-after.gif": before_and_after(Run(sys.argv[1]))}
+    write({}, pictures)

@@ -52,6 +52,21 @@ def over_continued(runs: Runs) -> str:
     return brief(difference(ran, "continued", "phase2")) + aside
 
 
+def few_rows() -> list[Row]:
+    """Return the README's rows: what self-examination adds where demonstrations are few."""
+    return [
+        {
+            "task": task,
+            "demonstrations": number,
+            "seeds": len(runs),
+            "imitation": success(runs, "phase1"),
+            "after self-examination": success(runs, "phase2"),
+            "difference, points": gain(runs),
+        }
+        for (task, number), runs in runs_of("few", TASKS).items()
+    ]
+
+
 def choice_rows(number: int) -> list[Row]:
     """Return what the instruction classifier chose with some number of demonstrations."""
     names = {"suitable": "rate", "states served": "served", "states that can be": "servable"}
@@ -97,6 +112,7 @@ def tables() -> dict[str, str]:
     """Return every table by name."""
     studied = study_rows()
     found: dict[str, list[Row]] = {
+        "few": few_rows(),
         "results": [row for (_, number), row in studied.items() if number == 200],
         "up-to-2000": [row for (_, n), row in studied.items() if n <= 2000 and n != 200],
         "from-5000": [row for (_, number), row in studied.items() if number >= 5000],

@@ -3,6 +3,7 @@
 python recipes/two_phase.py task=pick seed=1
 """
 
+import math
 from collections.abc import Callable
 
 from _shared import load_demonstrations, open_run, simulator_of, world_of, write_result
@@ -30,6 +31,11 @@ from report import report
 
 def two_phase(options: Options) -> dict:
     last = STAGES.index(options.until or STAGES[-1])
+    print(
+        f"{options.task}, {options.demonstrations.n:,} demonstrations: about "
+        f"{math.ceil(expected_minutes(options))} minutes of a core; what is interrupted goes on",
+        flush=True,
+    )
     for name, stage in stages_of(options).items():
         if STAGES.index(name) <= last:
             stage(options)
@@ -43,6 +49,25 @@ def two_phase(options: Options) -> dict:
         results = {**results, **references(options)}
     write_result(options, results, "demo")
     return results
+
+
+def expected_minutes(options: Options) -> float:
+    """Estimate how long a run takes on a CPU, by what its stages took on one core of a server.
+
+    Time per step and per sample, in seconds; of slow simulators, their own time comes on top.
+    """
+    imitate, told, goal = options.imitate, options.instruction, options.goal
+    tried = sum(imitate.trials / 2**k for k in range(imitate.trial_halvings + 1))
+    steps = imitate.steps + (tried - 1) * imitate.trial_steps
+    seconds = steps * (7e-3 + 4e-5 * imitate.batch_size)
+    fresh = 32 if options.demonstrations.n < told.fresh_states else 0
+    scored = (told.steps + (told.trials - 1) * told.trial_steps) * told.batch_size
+    seconds += scored * (1 + told.negatives + fresh) * 1e-5
+    seconds += goal.steps * goal.batch_size * (1 + goal.negatives) * 4e-5
+    practised = options.self_examine
+    seconds += practised.iterations * practised.num_envs * practised.steps * 5e-4
+    seconds += options.evaluate.episodes * 8e-3
+    return (20 + seconds * (4 if options.preset == "paper" else 1)) / 60
 
 
 def phase_1_alone(options: Options) -> str | None:

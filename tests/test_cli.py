@@ -121,7 +121,7 @@ def test_results_of_several_seeds_end_in_one_table(recipes, capsys):
     assert run("run", "greet", "-m", "task=measure", "seed=4,6", "preset=strong,paper") == 0
     *_, strong, paper = capsys.readouterr().out.splitlines()
     assert strong.split()[:3] == ["measure-strong-demo-seed*", "2", "70.0%"]
-    assert paper.split()[:3] == ["measure-paper-demo-seed*", "2", "70.0%"]
+    assert paper.split()[:3] == ["measure-paper-many-seed*", "2", "70.0%"]
 
 
 @pytest.mark.parametrize("task", ["interrupt", "end", "within"])

@@ -101,7 +101,7 @@ def test_a_name_may_be_quoted_refer_to_others_or_be_none(monkeypatch):
 @pytest.mark.parametrize("preset", ["strong", "paper"])
 @pytest.mark.parametrize(
     ("budget", "world"),
-    [("tiny", "grid"), ("demo", "babyai"), ("few", "gymnasium"), ("full", "grid")],
+    [("tiny", "grid"), ("many", "babyai"), ("few", "gymnasium"), ("full", "grid")],
 )
 def test_presets_budgets_and_worlds_fit_together(preset, budget, world):
     options = options_of(f"preset={preset}", f"budget={budget}", f"world={world}")
@@ -116,10 +116,12 @@ def test_few_demonstrations_take_a_budget_of_their_own_unless_one_is_named(tmp_p
         options = options_of(*said)
         return options.budget, options.demonstrations.n, options.imitate.batch_size
 
+    assert imitate()[:2] == ("demo", 50)
+    assert imitate("world=babyai")[:2] == imitate("preset=paper")[:2] == ("many", 3000)
     assert imitate("demonstrations.n=999") == ("few", 999, 64)
-    assert imitate("demonstrations.n=1000") == ("demo", 1000, 256)
-    assert imitate("demonstrations.n=999", "budget=demo") == ("demo", 999, 256)
-    assert imitate("demonstrations.n=999", "preset=paper") == ("demo", 999, 128)
+    assert imitate("demonstrations.n=1000") == ("many", 1000, 256)
+    assert imitate("demonstrations.n=999", "budget=many") == ("many", 999, 256)
+    assert imitate("demonstrations.n=999", "preset=paper") == ("many", 999, 128)
     record_demonstrations("move", 250, seed=0).save(tmp_path / "more")  # than few would record
     assert imitate(f"recorded={tmp_path / 'more'}") == ("few", 250, 64)
 

@@ -269,7 +269,8 @@ class Options:
     preset: str = MISSING
     """Networks and how they learn: ``strong`` (the best that we know) or ``paper``."""
     budget: str = MISSING
-    """How much data and how many steps: ``tiny``, ``demo``, ``few`` or ``full``."""
+    """How much data and how many steps: ``tiny``, ``few`` or ``many`` by the number of
+    demonstrations, ``full`` (the paper's 80,000), or ``demo``, where nothing is named."""
     seed: int = 0
     """Of all randomness."""
     device: str = "cpu"

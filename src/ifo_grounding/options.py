@@ -140,9 +140,11 @@ def _settled(overrides: Sequence[str]) -> Options:
     _refuse_unknown(cfg)
     named = [each.key_or_group for each in OverridesParser.create().parse_overrides(overrides)]
     number = _demonstrations(cfg)
-    if number < FEW and cfg.preset == "strong" and "budget" not in named:
-        cfg = compose(CONFIG, [*overrides, "budget=few"])
-    cfg.demonstrations.n = number  # all that were recorded, not as many as the budget would record
+    counted = not {"demonstrations.n", "recorded", "world"}.isdisjoint(named)
+    if cfg.preset == "strong" and "budget" not in named and not (counted and number >= FEW):
+        cfg = compose(CONFIG, [*overrides, f"budget={'few' if counted else 'demo'}"])
+    if counted:  # all that were recorded, not as many as the budget would record
+        cfg.demonstrations.n = number
     made = Run(cfg.run).options()
     return _typed(cfg if made is None else _goes_on(cfg, made, named))
 
