@@ -37,15 +37,21 @@ from ifo_grounding.stats import Rate
 from ifo_grounding.training import Run
 
 CURVES = {
-    "imitate": ("Imitation", ["loss_imitation", "accuracy"]),
+    "imitate": ("How imitation learned", ["loss_imitation", "accuracy"]),
     "train_instruction": (
-        "Instruction classifier",
+        "How the instruction classifier learned",
         ["positive_probability", "negative_probability", "removed"],
     ),
-    "train_goal": ("Goal classifier", ["final_probability", "unfinished_probability"]),
-    "train_reward": ("Reward model", ["positive_probability", "negative_probability"]),
+    "train_goal": (
+        "How the goal classifier learned",
+        ["final_probability", "unfinished_probability"],
+    ),
+    "train_reward": (
+        "How the reward model learned",
+        ["positive_probability", "negative_probability"],
+    ),
     "self_examine": (
-        "Self-examination",
+        "How self-examination went",
         ["learned_return", "episode_length", "stopped", "entropy", "served_share", "clip_fraction"],
     ),
 }
@@ -170,7 +176,7 @@ def curves(run: Run) -> dict[str, Any]:
                 raise UserError(f"{path} holds no metrics: delete it or restore it")
             found[title] = training_curves(metrics, wanted)
             if stage == "self_examine":
-                title = "Audit of self-examination (validation scenes)"
+                title = "Learned return and true success (validation scenes)"
                 found[title] = training_curves(metrics, AUDIT)
     return found
 

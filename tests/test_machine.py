@@ -24,3 +24,17 @@ def test_several_threads_have_to_pay(tmp_path, monkeypatch, several, quota, chos
     set_threads = {1: 1.0, 2: several, 4: several}.get
     monkeypatch.setattr(torch, "set_num_threads", lambda n: tick.insert(0, set_threads(n)))
     assert machine.fastest_threads() == chosen
+
+
+def test_threads_are_measured_anew_only_where_they_were_chosen_by_that(monkeypatch):
+    found, fastest = [], iter([2, 1])
+    monkeypatch.setattr(machine, "fastest_threads", lambda: next(fastest))
+    monkeypatch.setattr(torch, "set_num_threads", found.append)
+    clock = [0.0]
+    monkeypatch.setattr(machine.time, "monotonic", lambda: clock[0])
+    for threads in ("auto", 3):
+        machine.choose_threads(threads)
+        for seconds in (20, 20):
+            clock[0] += seconds
+            machine.review_threads()
+    assert found == [2, 1, 3]  # not yet after 20 s, one busy core later, and a number as it is

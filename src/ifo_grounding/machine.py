@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import platform
 import time
 from pathlib import Path
@@ -14,6 +15,9 @@ from ifo_grounding.errors import UserError
 MOST_THREADS = torch.get_num_threads()
 """Torch's own choice, which heeds ``OMP_NUM_THREADS`` and the affinity of the process."""
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
+REVIEW = 30.0
+"""Seconds after which the number of threads that was fastest is measured anew."""
+_due = math.inf
 
 
 def machine_of(device: torch.device | str) -> str:
@@ -34,6 +38,23 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def choose_threads(threads: int | str) -> None:
+    """Compute with so many threads or, with ``auto``, with as many as are fastest now.
+
+    Training loops measure the latter anew every half a minute (:func:`review_threads`).
+    """
+    global _due
+    auto = threads == "auto"
+    torch.set_num_threads(fastest_threads() if auto else int(threads))
+    _due = time.monotonic() + REVIEW if auto else math.inf
+
+
+def review_threads() -> None:
+    """Measure anew which number of threads is fastest, if it is chosen by that and time to."""
+    if time.monotonic() > _due:
+        choose_threads("auto")
 
 
 def fastest_threads() -> int:

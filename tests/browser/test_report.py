@@ -75,12 +75,8 @@ def test_it_needs_no_network_and_shows_every_picture(opened, page_of_a_run):
     assert len(widths) >= 10
     assert min(widths) > 0
     headings = opened.locator("h2").all_inner_texts()
-    for heading in (
-        "All that was measured",
-        "Step by step, scene 0",
-        "Chosen instructions",
-        "Self-examination",
-    ):
+    wanted = ("All that was measured", "Step by step, scene 0", "Chosen instructions")
+    for heading in (*wanted, "How self-examination went"):
         assert heading in headings
 
 

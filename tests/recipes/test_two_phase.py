@@ -48,7 +48,7 @@ def test_both_phases_of_strong_run_through_and_write_a_report(options, tmp_path)
     assert kept["options"]["preset"] == "strong" and kept["machines"]["imitate"]
 
     text = re.sub("base64,[A-Za-z0-9+/=]+", "", report(given).read_text())  # which may say anything
-    assert "Self-examination" in text and "http" not in text
+    assert "How self-examination went" in text and "http" not in text
     assert "unseen scenes" in text or "is kept" in text
     assert "scene by scene" in text and "How it was made" in text
     audit = read_json(run / "metrics" / "self_examine.json")
