@@ -8,7 +8,7 @@ DEV := .venv/.installed-dev
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: help demo test coverage test-slow test-browser test-gpu bench lint types docs format wheel clean
+.PHONY: help demo test coverage test-slow test-browser test-gpu test-oldest test-newest bench lint types docs format wheel clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -32,6 +32,12 @@ test-browser: $(DEV) ## tests that open pages in headless Chromium: the system's
 test-gpu: $(DEV) ## tests that need a GPU, and those that pretend one where there is none
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m gpu $(ARGS)
 	OMP_NUM_THREADS=1 $(BIN)/pytest tests/test_devices.py tests/recipes/test_two_phase.py -k gpu $(ARGS)
+
+test-oldest: ## a quick try of every extra, each dependency at its lower bound (in .venv-oldest)
+	$(PYTHON) tests/environments.py oldest $(ARGS)
+
+test-newest: ## the same with the newest versions, upper bounds left out (in .venv-newest)
+	$(PYTHON) tests/environments.py newest $(ARGS)
 
 bench: $(DEV) ## speed of every part beside peers, in under ten minutes (ARGS="pixels step")
 	for peer in navix minigrid imitation; do \
@@ -60,7 +66,7 @@ wheel: $(DEV) ## build dist/*.whl
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
 
 clean: ## remove the environment and all that was built
-	rm -rf .venv build dist site htmlcov .coverage .coverage.* .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-oldest .venv-newest build dist site htmlcov .coverage .coverage.* .pytest_cache .mypy_cache .ruff_cache
 
 $(RUN): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv

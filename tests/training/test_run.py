@@ -169,6 +169,15 @@ def test_all_stages_of_a_run_are_one_run_of_wandb(tmp_path, monkeypatch):
     assert made[2][0] == "other" and made[2][1] != made[0][1]
 
 
+def test_wandb_itself_takes_the_metrics_of_a_stage(tmp_path, monkeypatch):
+    wandb = pytest.importorskip("wandb", reason="make test-oldest and test-newest install it")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    Run(tmp_path / "run", "wandb").stage("imitate").log()({"loss": 1.0}, 10)
+    assert wandb.run.summary["imitate/loss"] == 1.0
+    wandb.finish()
+    assert list((tmp_path / "run" / "logs").rglob("*.wandb"))
+
+
 @pytest.fixture
 def first(tmp_path):
     """A run of two finished stages."""

@@ -23,10 +23,12 @@ def read_video(path: Path) -> Iterator[Image.Image]:
     The time of a frame in seconds is its ``info["time"]``.
     """
     av = optional("av", extra="video")
+    # What titles say is not read, nor has to be UTF-8: since PyAV 19 it needs no option for that.
+    lenient = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
     whole, end = 0, 0.0
     try:
         opened = f"file:{regular_file(path)}"
-        with av.open(opened, options=OPTIONS, metadata_errors="replace") as video:
+        with av.open(opened, options=OPTIONS, **lenient) as video:
             if not video.streams.video:
                 raise UserError(f"{path} cannot be read (it shows nothing: is it cut short?)")
             stream = video.streams.video[0]
