@@ -5,6 +5,8 @@ DEVICE ?= cpu
 BIN := .venv/bin
 RUN := .venv/.installed
 DEV := .venv/.installed-dev
+# In this checkout, what its golden files and results were made with.
+TORCH ?= "torch<2.14"
 
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
@@ -70,10 +72,10 @@ clean: ## remove the environment and all that was built
 
 $(RUN): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable . $(TORCH)
 	@touch $@
 
 $(DEV): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --editable ".[dev,docs]"
+	$(BIN)/python -m pip install --quiet --editable ".[dev,docs]" $(TORCH)
 	@touch $(RUN) $@
