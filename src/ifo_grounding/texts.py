@@ -6,8 +6,8 @@ import re
 
 UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters, which command a terminal, and halves of characters, which nothing encodes."""
-MARKUP = re.compile(r"<(?=[A-Za-z/!?])|(?<=\])(?=\()")
-"""Where markdown takes a text for HTML, or for a link or a picture."""
+MARKUP = re.compile(r"<(?!br>)(?=[A-Za-z/!?])|(?<=\])(?=\()")
+"""Where markdown takes a text for HTML, but for a line break, or for a link or a picture."""
 
 
 def one_line(text: object) -> str:
