@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ifo_grounding.errors import UserError, did_you_mean
+from ifo_grounding.texts import one_line
 
 USAGE_ERROR, INTERRUPTED, CLOSED = 2, 130, 141
 HELP = ("-h", "--help")
@@ -45,7 +46,7 @@ def one_line_errors() -> Iterator[None]:
     except (UserError, OSError) as error:
         if os.environ.get("IFO_GROUNDING_TRACEBACK") == "1":
             raise
-        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        print("error:", one_line(error), file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
     except (KeyboardInterrupt, RuntimeError) as error:
         # Within tensordict's `with params.to_module(...)` an interruption becomes a RuntimeError.

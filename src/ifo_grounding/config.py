@@ -252,6 +252,7 @@ class NetworksConfig:
         check_range(self, "features", least=1, most=4096)
         check_range(self, "dropout", least=0, most=0.999)
         check_range(self, "sentence_rate", above=0, most=1000)
+        check_choice("sentence_pooling", self.sentence_pooling, (None, "last", "mean"))
 
     def changed(self) -> dict[str, Any]:
         """Return the values that are not the preset's."""

@@ -11,9 +11,14 @@ from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
+from ifo_grounding.texts import one_line
+
 
 class UserError(ValueError):
     """Bad input: says what was wrong, what is allowed and what to do, in one line."""
+
+    def __init__(self, message: object) -> None:
+        super().__init__(one_line(message))  # of what others say, such as Arrow, there are many
 
 
 def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
@@ -44,6 +49,19 @@ def at_least_one(name: str, value: object) -> int:
         bound = "at least 1" if number < 1 else "below 2**63"
         raise UserError(f"{name} must be {bound}, got {number}")
     return number
+
+
+def share(name: str, value: Any) -> float:
+    """Return a share or a probability, or refuse what is no number within 0..1.
+
+    >>> share("fraction", 1.5)
+    Traceback (most recent call last):
+    ifo_grounding.errors.UserError: fraction must be within 0..1, got 1.5
+    """
+    with contextlib.suppress(TypeError, ValueError, RuntimeError):  # no number, or several
+        if not isinstance(value, str | bytes) and 0 <= (number := float(value)) <= 1:
+            return number
+    raise UserError(f"{name} must be within 0..1, got {value!r:.40}")
 
 
 def check_below(what: str, values: Any, count: int) -> None:

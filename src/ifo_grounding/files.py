@@ -120,12 +120,15 @@ def _finite(content: Any) -> Any:
 def read_json(path: str | Path, kind: Any = object, keys: Collection[str] = ()) -> Any:
     """Read JSON, or refuse what is missing, damaged, no ``kind`` or a dict without ``keys``."""
     try:
-        content = json.loads(Path(path).read_text())
+        path = Path(path)
+        content = json.loads((regular_file(path) if path.exists() else path).read_text())
         if not isinstance(content, kind) or any(key not in content for key in keys):
             held = f" with {', '.join(keys)}" if keys else ""
             raise ValueError(f"it holds no {kind.__name__}{held}")
         return content
     except FileNotFoundError:
         raise UserError(f"{path} does not exist") from None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error})") from None
     except (ValueError, RecursionError) as error:  # no JSON, no text, too deep or too long
         raise UserError(f"{path} is not valid JSON ({error}): delete it or restore it") from None

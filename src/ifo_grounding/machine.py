@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import platform
 import time
 from pathlib import Path
@@ -57,12 +58,18 @@ def review_threads() -> None:
         choose_threads("auto")
 
 
-def fastest_threads() -> int:
-    """Return 1, or how many threads this process may use, where they do small layers faster now."""
-    most = MOST_THREADS
+def cores() -> int:
+    """Return how many cores this process may use, by its affinity and by its control group."""
+    most = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with contextlib.suppress(OSError, ValueError):  # "max 100000", where there is no quota
         quota, period = map(int, QUOTA.read_text().split())
         most = max(1, min(most, quota // period))
+    return most
+
+
+def fastest_threads() -> int:
+    """Return 1, or how many threads this process may use, where they do small layers faster now."""
+    most = min(MOST_THREADS, cores())
     seconds: dict[int, list[float]] = {1: [], most: []}
     batch = torch.ones(256, 256)
     for number in [*seconds] * 20:
@@ -79,7 +86,7 @@ def check_device(device: torch.device | str) -> None:
     """Raise :class:`UserError` unless networks can be on a device here."""
     try:
         kind = torch.device(device).type
-    except RuntimeError:
+    except (RuntimeError, TypeError, ValueError):  # no name, no number, or a GPU where none is
         kind = "unknown"
     if kind not in ("cpu", "cuda"):
         raise UserError(f"device={device} is none: use cpu, cuda or cuda:0")

@@ -178,6 +178,8 @@ def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Sequence[str]) -> Dic
 
 def _typed(cfg: DictConfig) -> Options:
     """Return options as dataclasses, whose ranges are checked."""
+    if missing := sorted(OmegaConf.missing_keys(cfg)):
+        raise UserError(f"option {missing[0]} has no value: give {missing[0]}=...")
     values = plain(cfg)
     for name, value in leaves(values).items():
         if isinstance(value, int) and abs(value) > LARGEST and not name.endswith("seed"):

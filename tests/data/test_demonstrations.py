@@ -288,6 +288,11 @@ def flip(folder):
     (folder / "tiles.npy").write_bytes(content)
 
 
+def edit_facts(folder, change):
+    """Change facts of a folder, as of one that an older version wrote: without their checksum."""
+    edit(folder, lambda meta: (meta.pop("facts_crc32"), change(meta["facts"])))
+
+
 DAMAGE = {
     "no folder": (lambda f: f.rename(f.with_name("moved")), "is not a folder of"),
     "bad json": (lambda f: (f / "meta.json").write_text("{"), "meta.json is not valid JSON"),
@@ -300,8 +305,8 @@ DAMAGE = {
     "pipe": (lambda f: ((f / "codes.npy").unlink(), os.mkfifo(f / "codes.npy")), "is missing"),
     "damaged": (flip, "the checksum of tiles.npy is not the one in meta.json"),
     "pickle": (lambda f: resave(f, "lengths", np.array([{}])), "is damaged: .* allow_pickle=False"),
-    "no words": (lambda f: edit(f, lambda m: m["facts"].pop("words")), "is damaged: 'words'"),
-    "words": (lambda f: edit(f, lambda m: m["facts"].update(words=["a", "a"])), "word twice"),
+    "no words": (lambda f: edit_facts(f, lambda m: m.pop("words")), "is damaged: 'words'"),
+    "words": (lambda f: edit_facts(f, lambda m: m.update(words=["a", "a"])), "word twice"),
     "actions": (lambda f: resave(f, "actions", np.zeros(7, np.int64)), "holds actions, .* place f"),
 }
 

@@ -48,7 +48,7 @@ def test_a_camera_of_videos_is_read_without_actions(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "options", "said"),
     [
-        ({}, {"camera": None}, f"unknown camera None: choose one of '{TOP}', 'wrist'"),
+        ({}, {"camera": None}, f"camera=None is none of '{TOP}', 'wrist': choose with camera="),
         ({"info": INFO | {"codebase_version": "v2.1"}}, {}, "format v2.1: convert it to v3"),
         ({"info": INFO | {"fps": 0}}, {}, "cannot be read as LeRobot's v3.0 .*division"),
         ({"tasks": [["go"], ["go", "on"]]}, {}, "episode 1: it has 2 tasks: a demonstration foll"),

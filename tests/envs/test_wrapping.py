@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
-from gymnasium.wrappers import FrameStackObservation
+from gymnasium.wrappers import FrameStackObservation, TimeLimit
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
@@ -222,9 +222,10 @@ def outcome(reward=0.0, **seen):
     ],
 )
 def test_steps_that_do_not_fit_are_refused(step, said):
-    env = from_gymnasium(like(step=step), seed=0, **DIAL)
-    with pytest.raises(UserError, match=said):
-        env.rollout(1)
+    for make in (like(step=step), lambda: TimeLimit(like(step=step)(), 9)):
+        env = from_gymnasium(make, seed=0, **DIAL)
+        with pytest.raises(UserError, match=said):
+            env.rollout(1)
 
 
 def test_actions_are_numbered_from_0_and_a_reward_may_be_an_array():

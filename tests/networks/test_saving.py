@@ -238,7 +238,7 @@ def test_a_network_takes_the_place_of_another(mine):
     assert card.startswith("---\nlibrary_name: ifo-grounding\n")
     for shown in ("names the action", "| Preset | strong |", "3x16x16", *facts.values()):
         assert shown in card
-    assert r"| Level\| of mine | a\|b c ? |" in card
+    assert r"| Level\| of mine | a\|b c |" in card
 
 
 def test_what_cannot_be_shared_or_found_is_said(mine, tmp_path, monkeypatch):

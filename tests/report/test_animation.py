@@ -77,7 +77,7 @@ def test_animation_refusals():
         animation([episode([(0, 0, 0)] * 2, True)], titles=["a", "b"])
     with pytest.raises(UserError, match="6 actions and 3 names"):
         animation([episode([(0, 0, 0)] * 2, True)], actions="LRS")
-    with pytest.raises(UserError, match=r"uint8 \[3, H, W\]"):
+    with pytest.raises(UserError, match=r"uint8 \[C, H, W\]"):
         animation([Episode(np.zeros((2, 48, 48, 3)), np.array([5]), "a", True, True, 0)])
 
 

@@ -133,7 +133,7 @@ def test_candidates_are_distinct_and_uniform():
     ("options", "message"),
     [
         ({"threshold": 1.0}, "threshold is a probability"),
-        ({"threshold": -0.1}, "threshold is a probability"),
+        ({"threshold": -0.1}, "threshold must be within 0..1"),
         ({"candidates": 0}, "candidates must be at least 1"),
         ({"choose": "worst"}, "unknown choose 'worst'"),
     ],

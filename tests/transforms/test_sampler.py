@@ -158,7 +158,7 @@ def test_nothing_suitable_is_one_clear_line():
 def test_impossible_options_are_refused_at_once():
     with pytest.raises(UserError, match="max_tries must be at least 1"):
         make(max_tries=0)
-    with pytest.raises(UserError, match="threshold is a probability"):
+    with pytest.raises(UserError, match=r"threshold must be within 0\.\.1"):
         make(threshold=2.0)
 
 

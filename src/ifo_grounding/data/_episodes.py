@@ -13,9 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ifo_grounding.channels import channels_last
-from ifo_grounding.errors import UserError, check_below, optional
+from ifo_grounding.errors import UserError, at_least_one, check_below, optional
 from ifo_grounding.files import regular_file
-from ifo_grounding.tasks.vocabulary import MOST_WORDS, Vocabulary, words_of
+from ifo_grounding.tasks.vocabulary import MOST_WORDS, Vocabulary, check_vocabulary, words_of
 
 PIECE_FRAMES = 512
 PIECE_BYTES = 16 << 20
@@ -40,7 +40,10 @@ class Reader:
         length: int | None = None,
     ) -> None:
         self.close, self.vocabulary = close, vocabulary
-        self.length = vocabulary.length if vocabulary is not None else length or MOST_WORDS
+        if vocabulary is not None:
+            check_vocabulary(vocabulary)
+        given = MOST_WORDS if length is None else at_least_one("length", length)
+        self.length = given if vocabulary is None else vocabulary.length
         self.lengths: list[int] = []
         self.sentences: list[str] = []
         self._first: tuple[Name, list[int]] | None = None
@@ -133,16 +136,24 @@ def open_table(path: Path, kind: str = "parquet", **options: Any) -> Any:
     for file in [path, *path.rglob("*")]:
         if not file.is_dir():
             regular_file(file)
-    return optional("pyarrow.dataset", extra="datasets").dataset(path, format=kind, **options)
+    dataset: Any = optional("pyarrow.dataset", extra="datasets")
+    form: Any = kind
+    if kind == "parquet":  # pages that have a checksum are compared with it
+        checks = dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
+        form = dataset.ParquetFileFormat(default_fragment_scan_options=checks)
+    return dataset.dataset(path, format=form, **options)
 
 
 def read_table(table: Any, **chosen: Any) -> Any:
     """Return what is chosen of a table, which is of one episode; refuse too much of it."""
-    read: list[Any] = []
-    for batch in table.to_batches(batch_size=256, **chosen):
-        read.append(batch)
-        check_size(sum(part.num_rows for part in read), sum(part.nbytes for part in read))
-    return optional("pyarrow", extra="datasets").Table.from_batches(read)
+    arrow, read = optional("pyarrow", extra="datasets"), list[Any]()
+    try:
+        for batch in table.to_batches(batch_size=256, **chosen):
+            read.append(batch)
+            check_size(sum(part.num_rows for part in read), sum(part.nbytes for part in read))
+        return arrow.Table.from_batches(read)
+    except arrow.ArrowException as error:  # some are no errors of Python's own kinds
+        raise OSError(error) from None
 
 
 @contextlib.contextmanager

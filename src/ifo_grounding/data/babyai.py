@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stdout
@@ -33,6 +34,8 @@ DONE = BABYAI_ACTIONS.index("done")
 """The action that does nothing: how a policy says that it is done."""
 PATIENCE = 3
 """How many times as many episodes as asked for are played before the bot counts as unable."""
+ENDINGS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a recording, which processes side by side leave to their parent."""
 
 Make = Callable[[], gymnasium.Env]
 
@@ -207,9 +210,21 @@ def _played(make: Make, seeds: Iterator[int], processes: int) -> Iterator[Played
         yield from map(play, seeds)
         return
     # Fresh processes: forked ones would inherit torch's threads.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn"), _heed_the_parent) as pool:
         while some := list(itertools.islice(seeds, 16 * processes)):
-            yield from pool.map(play, some)
+            signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)  # new processes inherit it
+            try:
+                found = pool.map(play, some)
+            finally:
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDINGS)
+            yield from found
+
+
+def _heed_the_parent() -> None:
+    """Let the parent end this process where a signal reaches both, or end after ten seconds."""
+    for ending in ENDINGS:
+        signal.signal(ending, lambda *_: signal.alarm(10))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDINGS)
 
 
 def _play(make: Make, seed: int) -> Played | None:

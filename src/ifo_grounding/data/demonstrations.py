@@ -18,9 +18,9 @@ from ifo_grounding.data._episodes import Episode, Reader, check_parts, padded, r
 from ifo_grounding.data._spool import same_rows, take
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
-from ifo_grounding.errors import UserError, whole
+from ifo_grounding.errors import UserError, share, whole
 from ifo_grounding.seeding import generator as seeded
-from ifo_grounding.tasks.vocabulary import Vocabulary, words_of
+from ifo_grounding.tasks.vocabulary import Vocabulary, check_vocabulary, words_of
 
 KIND = "ifo-grounding demonstrations"
 
@@ -73,6 +73,7 @@ class Demonstrations:
         vocabulary_size: int | None = None,
     ) -> None:
         if vocabulary is not None:
+            check_vocabulary(vocabulary)
             vocabulary_size = len(vocabulary)
             instructions = padded(instructions, vocabulary)
         elif vocabulary_size is None:
@@ -249,8 +250,7 @@ class Demonstrations:
 
     def split(self, fraction: float, seed: int = 0) -> tuple[Demonstrations, Demonstrations]:
         """Set a random ``fraction`` of the episodes aside: (the others, those)."""
-        if not 0.0 <= fraction <= 1.0:
-            raise UserError(f"fraction must be within 0..1, got {fraction}")
+        fraction = share("fraction", fraction)
         order = torch.randperm(len(self), generator=seeded(seed, "held-out demonstrations"))
         aside = round(fraction * len(self))
         return self[order[aside:].sort().values], self[order[:aside].sort().values]

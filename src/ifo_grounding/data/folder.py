@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -42,6 +43,7 @@ def save_folder(
             np.save(path, tensor.detach().cpu().numpy(), allow_pickle=False)
             listed[name] = {"crc32": zlib.crc32(np.memmap(path, mode="r").data)}
         meta = {"format": kind, "version": VERSION, "arrays": listed, "facts": dict(facts)}
+        meta["facts_crc32"] = _checksum(facts)
         write_json(temporary / META, meta)
 
 
@@ -84,11 +86,17 @@ def load_folder(
         )
     with damaged(folder):
         listed, facts = dict(meta["arrays"]), dict(meta["facts"])
+        if meta.get("facts_crc32") not in (None, _checksum(facts)):  # older folders have none
+            raise UserError(f"the checksum of the facts in {META} is another")
         if missing := sorted(set(names) - set(listed)):
             raise UserError(f"{META} does not list {', '.join(missing)}")
         if foreign := sorted(set(listed) - {*names, *optional}):
             raise UserError(f"it holds {', '.join(foreign)}, which {kind} have no place for")
         return {name: _load_array(folder / f"{name}.npy", listed[name]) for name in listed}, facts
+
+
+def _checksum(facts: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(dict(facts), sort_keys=True).encode())
 
 
 @contextlib.contextmanager

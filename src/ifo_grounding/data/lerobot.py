@@ -17,8 +17,8 @@ from ifo_grounding.data._video import read_video
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import DAMAGED
 from ifo_grounding.data.pictures import TRUNCATED, new_folder, rgb, written_sentences
-from ifo_grounding.errors import UserError, at_least_one, check_choice, optional
-from ifo_grounding.files import atomic_write, read_json, regular_file, write_json
+from ifo_grounding.errors import UserError, at_least_one, optional
+from ifo_grounding.files import atomic_write, read_json, write_json
 from ifo_grounding.progress import progress_bar
 
 INFO, VERSION = "meta/info.json", "v3.0"
@@ -75,7 +75,7 @@ class _Camera:
     """What a camera saw, in videos that go on from episode to episode, or in tables."""
 
     def __init__(self, folder: Path, name: str | None) -> None:
-        info = read_json(regular_file(folder / INFO))
+        info = read_json(folder / INFO)
         if info["codebase_version"] != VERSION:
             raise UserError(
                 f"{folder} is of LeRobot's format {info['codebase_version']}: convert it to "
@@ -84,7 +84,11 @@ class _Camera:
         kinds = {name: feature["dtype"] for name, feature in info["features"].items()}
         cameras = [name for name, kind in kinds.items() if kind in ("image", "video")]
         name = cameras[0] if name is None and len(cameras) == 1 else name
-        check_choice("camera", name, cameras)
+        if name not in cameras:
+            raise UserError(
+                f"camera={name} is none of {', '.join(map(repr, cameras))}: choose with camera=, "
+                "and for a recipe's recorded= save() what you read"
+            )
         self.folder, self.name, self.fps = folder, name, float(info["fps"])
         self.files = f"videos/{name}" if kinds[name] == "video" else "data"
         self.path, self.time = Path(), 0.0
@@ -104,7 +108,10 @@ class _Camera:
             table = open_table(path.with_suffix(".parquet"))
             here = optional("pyarrow.dataset", "datasets").field("episode_index")
             chosen = {"columns": [self.name, "frame_index"], "filter": here == row["episode_index"]}
-            pictures = read_table(table, **chosen).sort_by("frame_index")[self.name]
+            found = read_table(table, **chosen).sort_by("frame_index")
+            if found["frame_index"].to_pylist() != [*range(row["length"])]:
+                raise UserError(f"{path} holds no frames 0 to {row['length'] - 1}, or not once")
+            pictures = found[self.name]
         for step in steps:
             if self.files == "data":
                 yield f"frame {step}", pictures[step].as_py()["bytes"]
@@ -147,7 +154,7 @@ def save_lerobot(demos: Demonstrations, folder: str | Path) -> None:
         def write(name: str, rows: dict[str, Any], index: Any = None) -> None:
             path = temporary / f"{name}.parquet"
             path.parent.mkdir(parents=True, exist_ok=True)
-            pandas.DataFrame(rows, index).to_parquet(path)
+            pandas.DataFrame(rows, index).to_parquet(path, write_page_checksum=True)
 
         for number, sentence in enumerate(sentences):
             step = np.arange(int(lengths[number]))

@@ -86,7 +86,7 @@ def _local(minari: Any, dataset_id: str) -> MinariDataset:
             f"'minari download {dataset_id}', or check its name with 'minari list local'"
         )
     try:
-        if (count := read_json(regular_file(folder / "metadata.json"))["total_episodes"]) > 10**7:
+        if (count := read_json(folder / "metadata.json")["total_episodes"]) > 10**7:
             raise ValueError(f"it claims {count} episodes")
         return minari.load_dataset(dataset_id)
     except Exception as error:  # damaged metadata ends in many ways
@@ -129,6 +129,8 @@ def _episodes(
 
 
 def _text(value: Any) -> str:
+    if not isinstance(value, str | bytes):
+        raise TypeError(f"an instruction is text, got {type(value).__name__} {value!r:.40}")
     return value.decode() if isinstance(value, bytes) else str(value)
 
 

@@ -23,7 +23,7 @@ from ifo_grounding.data.buffers import encoded_buffer
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
-from ifo_grounding.errors import UserError, at_least_one, whole
+from ifo_grounding.errors import UserError, at_least_one, share, whole
 from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import generator as seeded
 
@@ -70,15 +70,16 @@ class RandomActions(TensorDictModuleBase):
             raise UserError(f"stop_action must be 0..{self.n_actions - 1}, got {stop_action}")
         self.probabilities = torch.full((self.n_actions,), 1 / self.n_actions)
         if stop_probability is not None:
-            if not 0.0 <= stop_probability <= 1.0 or self.n_actions < 2:
-                raise UserError(f"stop_probability must be within 0..1, got {stop_probability}")
+            stop_probability = share("stop_probability", stop_probability)
+            if self.n_actions < 2:
+                raise UserError("stop_probability is for several actions, and this world has one")
             if self.stop_action is None:
                 raise UserError(
                     "stop_probability is for worlds with a stop, and this one names none: give "
                     "stop_action="
                 )
             self.probabilities.fill_((1 - stop_probability) / (self.n_actions - 1))
-            self.probabilities[self.stop_action] = float(stop_probability)
+            self.probabilities[self.stop_action] = stop_probability
         self.generator = seeded(seed, "random actions")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

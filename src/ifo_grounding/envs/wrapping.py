@@ -19,7 +19,7 @@ from ifo_grounding.envs.reading import ENDED, Reading
 from ifo_grounding.envs.simulator import check_actions
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.seeding import STREAMS, derive
-from ifo_grounding.tasks.vocabulary import Vocabulary
+from ifo_grounding.tasks.vocabulary import Vocabulary, check_vocabulary
 
 Make = Callable[[], gymnasium.Env]
 
@@ -94,11 +94,7 @@ def from_gymnasium(
     flags = {"instructed": instructed, "skip_unknown": skip_unknown, "processes": processes}
     for name, flag in flags.items():
         check_choice(name, flag, (True, False))
-    if not isinstance(vocabulary, Vocabulary):
-        raise UserError(
-            "vocabulary is a Vocabulary, such as that of the demonstrations or "
-            f"Vocabulary.from_sentences(...), got {type(vocabulary).__name__}"
-        )
+    check_vocabulary(vocabulary)
     if isinstance(world, str):
         world = functools.partial(gymnasium.make, world, **make_options)
     elif make_options:

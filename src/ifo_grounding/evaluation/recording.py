@@ -25,7 +25,7 @@ class Episode:
     """One episode to look at."""
 
     frames: np.ndarray
-    """What was seen, uint8 [T + 1, 3, H, W]."""
+    """What was seen, uint8 [T + 1, C, H, W]."""
     actions: np.ndarray
     """What was done, int64 [T]."""
     sentence: str

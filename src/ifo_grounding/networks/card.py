@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ifo_grounding.networks.makers import Blueprint
+from ifo_grounding.texts import markdown_cell
 
 LIBRARY = "library_name: ifo-grounding"
 ROLES = {
@@ -28,7 +29,7 @@ def card(plan: Blueprint, facts: Mapping[str, object]) -> str:
         "Actions": shapes.n_actions,
         **facts,
     }
-    cells = [[_cell(each) for each in row] for row in rows.items() if row[1] is not None]
+    cells = [[markdown_cell(each) for each in row] for row in rows.items() if row[1] is not None]
     table = "\n".join(f"| {name} | {value} |" for name, value in cells)
     return f"""---
 {LIBRARY}
@@ -53,8 +54,3 @@ from ifo_grounding.networks import from_pretrained
 network = from_pretrained("path/to/this/folder")
 ```
 """
-
-
-def _cell(value: object) -> str:
-    """Return what a table's cell says, in one line and without the mark that ends it."""
-    return " ".join(str(value).split()).replace("|", r"\|")

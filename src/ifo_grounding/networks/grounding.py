@@ -19,7 +19,7 @@ from ifo_grounding.networks.appearance import EVIDENCE, Appearance, ColourAndFor
 from ifo_grounding.networks.cells import cell_places, look_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.layers import convolutions
-from ifo_grounding.networks.sentences import without_padding
+from ifo_grounding.networks.sentences import rows_of_ids, without_padding
 from ifo_grounding.networks.shapes import Shapes, grid_of, patch_size
 
 ROLE, SIDE = 8, 4
@@ -190,7 +190,7 @@ class GroundedTrunk(nn.Module):
     def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
         cells = self.appearance(image)
-        tokens = without_padding(tokens.long(), self.words.role.num_embeddings)
+        tokens = without_padding(rows_of_ids(tokens), self.words.role.num_embeddings)
         logits, modifier = self.words(cells, tokens)
         maps = weigh(logits)
         silent = torch.cat([self.attention(cells.silhouette), self.value(cells.silhouette)], -1)

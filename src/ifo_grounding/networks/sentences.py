@@ -69,7 +69,7 @@ class GRUInstructionEncoder(nn.Module):
         Raises:
             UserError: where an id lies outside the vocabulary; on a GPU, CUDA raises.
         """
-        rows = tokens.reshape(-1, tokens.shape[-1]).long()
+        rows = rows_of_ids(tokens)
         with torch.autocast(tokens.device.type, enabled=False):  # too small to gain from bf16
             if not rows.numel():
                 encoded = self.embedding.weight.new_zeros(len(rows), self.size)
@@ -184,6 +184,13 @@ def sentence_lengths(tokens: Tensor) -> Tensor:
     """Return the number of ids of each row up to the last that is not padding."""
     place = torch.arange(1, tokens.shape[-1] + 1, device=tokens.device)
     return torch.where(tokens != 0, place, 0).amax(-1)
+
+
+def rows_of_ids(tokens: Tensor) -> Tensor:
+    """Return token ids [*B, L] as int64 [N, L], or refuse what is no whole number."""
+    if tokens.is_floating_point() or tokens.is_complex() or tokens.dtype == torch.bool:
+        raise UserError(f"instructions hold whole token ids, got {tokens.dtype}: give int64")
+    return tokens.reshape(-1, tokens.shape[-1]).long()
 
 
 def without_padding(tokens: Tensor, words: int) -> Tensor:

@@ -16,7 +16,7 @@ from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.grounding import AROUND, FORMS, MODIFIER, WordMaps, surroundings
 from ifo_grounding.networks.layers import head
 from ifo_grounding.networks.scoring import PairScorer
-from ifo_grounding.networks.sentences import without_padding
+from ifo_grounding.networks.sentences import rows_of_ids, without_padding
 from ifo_grounding.networks.shapes import Shapes, patch_size
 
 
@@ -106,7 +106,7 @@ class WordScorer(PairScorer):
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
         """Map token ids [*B, L] to how much each word counts, and the modifier: [*B, D]."""
-        tokens, which = distinct_rows(instruction.reshape(-1, instruction.shape[-1]).long())
+        tokens, which = distinct_rows(rows_of_ids(instruction))
         tokens = without_padding(tokens, self.known)
         with torch.autocast(tokens.device.type, enabled=False):
             spoken, modifier = self.words.listen(tokens)

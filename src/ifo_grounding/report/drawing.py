@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.report.theme import FAINT, INK, PAPER, RUNNING
+from ifo_grounding.texts import one_line
 
 BORDER, PADDING, TEXT_SIZE, LINE = 4, 8, 14, 19
 
@@ -22,7 +23,7 @@ class Captioned(NamedTuple):
     """A picture with its caption, such as a state with the instruction that was chosen for it."""
 
     frame: np.ndarray
-    """Pixels, uint8 [3, H, W]."""
+    """Pixels, uint8 [C, H, W]."""
     caption: str
     """Sentence below the picture."""
     title: str = ""
@@ -42,24 +43,38 @@ def font(bold: bool = False) -> ImageFont.FreeTypeFont:
 
 
 def upscaled(frame: ArrayLike, width: int) -> Image.Image:
-    """Return a frame, uint8 [3, H, W], enlarged without blur to about ``width`` pixels.
+    """Return a frame, uint8 [C, H, W], enlarged without blur to about ``width`` pixels.
 
     >>> upscaled(np.zeros((3, 48, 48), dtype=np.uint8), 200).size
     (192, 192)
     """
     pixels = np.asarray(frame)
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[0] != 3:
-        raise UserError(f"a frame is uint8 [3, H, W], got {pixels.dtype} {list(pixels.shape)}")
-    picture = Image.fromarray(np.ascontiguousarray(pixels.transpose(1, 2, 0)))
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or not pixels.size:
+        raise UserError(f"a frame is uint8 [C, H, W], got {pixels.dtype} {list(pixels.shape)}")
+    picture = Image.fromarray(coloured(pixels))
     scale = max(1, width // picture.width)
     size = (scale * picture.width, scale * picture.height)
     return picture.resize(size, Image.Resampling.NEAREST)
 
 
+def coloured(frame: np.ndarray) -> np.ndarray:
+    """Return a frame, uint8 [C, H, W], in colours as people see it, [H, W, 3].
+
+    Of stacked frames the last one is shown; of four channels the first three, the last being alpha;
+    where channels are no colours, the last one is shown in grey.
+
+    >>> coloured(np.zeros((12, 48, 40), dtype=np.uint8)).shape
+    (48, 40, 3)
+    """
+    channels = len(frame)
+    shown = frame[:3] if channels == 4 else frame[-3:] if channels % 3 == 0 else frame[-1:]
+    return np.ascontiguousarray(np.broadcast_to(shown, (3, *frame.shape[1:])).transpose(1, 2, 0))
+
+
 def wrapped(text: str, width: int) -> list[str]:
     """Break a text into lines that fit into ``width`` pixels."""
     lines = [""]
-    for word in text.split():
+    for word in one_line(text).split():
         longer = f"{lines[-1]} {word}".strip()
         if lines[-1] and font().getlength(longer) > width:
             lines.append(word)
@@ -108,7 +123,7 @@ def _draw_cell(cell: Captioned, width: int, above: int, below: int) -> Image.Ima
     size = (max(framed[0], width + 2 * BORDER), above + framed[1] + below)
     canvas = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(canvas)
-    draw.text((0, 0), cell.title, FAINT, font(bold=True))
+    draw.text((0, 0), one_line(cell.title), FAINT, font(bold=True))
     draw.rectangle((0, above, framed[0] - 1, above + framed[1] - 1), fill=cell.colour)
     canvas.paste(picture, (BORDER, above + BORDER))
     y = above + framed[1] + 4
@@ -116,5 +131,5 @@ def _draw_cell(cell: Captioned, width: int, above: int, below: int) -> Image.Ima
         draw.text((0, y), line, INK, font())
         y += LINE
     legible = FAINT if cell.colour == RUNNING else cell.colour
-    draw.text((0, y), cell.note, legible, font(bold=True))
+    draw.text((0, y), one_line(cell.note), legible, font(bold=True))
     return canvas

@@ -35,12 +35,14 @@ def training_curves(
         panels: which metrics, in which order, or {title: {metric: label}}; all metrics where None.
 
     Raises:
-        UserError: where none of the metrics was logged.
+        UserError: where none of the metrics was logged, or a row has no step.
 
     >>> figure = training_curves([{"step": step, "loss": 3.0 - step} for step in range(3)])
     >>> figure.axes[0].get_title(loc="left")
     'loss'
     """
+    if any("step" not in row for row in history):
+        raise UserError("every row of a history has its 'step', and one here has none")
     logged = [name for name in dict.fromkeys(n for row in history for n in row) if name != "step"]
     if not isinstance(panels, Mapping):
         panels = {name: {name: name} for name in (logged if panels is None else panels)}

@@ -9,6 +9,7 @@ from typing import Any
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.stats import Difference, Estimate, Rate
+from ifo_grounding.texts import markdown_cell, one_line
 
 Row = Mapping[str, Any]
 """One row of a table: what each column says."""
@@ -31,7 +32,7 @@ def format_cell(value: Any) -> str:
         return f"{value:,}"
     if isinstance(value, float):
         return f"{value:.3g}" if math.isfinite(value) else MISSING
-    return str(value)
+    return one_line(value)
 
 
 def is_number(value: Any) -> bool:
@@ -65,7 +66,7 @@ def text_table(rows: Sequence[Row]) -> str:
     """
     columns = []
     for name in columns_of(rows):
-        cells = [name, *(format_cell(row.get(name)) for row in rows)]
+        cells = [format_cell(name), *(format_cell(row.get(name)) for row in rows)]
         width = max(map(len, cells))
         cells.insert(1, "-" * width)
         right = _aligned_right(rows, name)
@@ -91,4 +92,4 @@ def markdown_table(rows: Sequence[Row]) -> str:
 
 def _escaped(text: str) -> str:
     """Return a cell as markdown takes it."""
-    return INTERVAL.sub("[\\1,\u00a0\\2]", " ".join(text.split()).replace("|", r"\|"))
+    return INTERVAL.sub("[\\1,\u00a0\\2]", markdown_cell(text))

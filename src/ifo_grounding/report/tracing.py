@@ -18,6 +18,7 @@ from ifo_grounding import keys
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.tracing import Trace
 from ifo_grounding.report.animation import gif
+from ifo_grounding.report.drawing import coloured
 from ifo_grounding.report.theme import (
     FAINT,
     INK,
@@ -28,6 +29,7 @@ from ifo_grounding.report.theme import (
     new_panels,
     without_formulas,
 )
+from ifo_grounding.texts import one_line
 
 
 def trace_animation(trace: Trace, *, actions: Sequence[str] = keys.ACTIONS) -> bytes:
@@ -46,7 +48,7 @@ def trace_animation(trace: Trace, *, actions: Sequence[str] = keys.ACTIONS) -> b
     count = trace.probabilities.shape[-1]
     if len(actions) != count:
         raise UserError(f"there are {count} actions and {len(actions)} names: name each of them")
-    board = _Board(trace, sharpest(trace.maps, 8), actions)
+    board = _Board(trace, sharpest(trace.maps, 8), [*map(one_line, actions)])
     end = len(trace.maps)
     return gif([board.picture(step) for step in range(max(0, end - 30), end)], fps=1.5)
 
@@ -70,7 +72,7 @@ class _Board:
         self.trace, self.chosen, self.names = trace, maps, actions
         self.figure, _ = new_panels(1, 7.2, 5.2)
         self.figure.clear()
-        sentence = textwrap.fill(trace.episode.sentence, 70)
+        sentence = textwrap.fill(one_line(trace.episode.sentence), 70)
         self.figure.suptitle(sentence, fontsize=12, fontweight="bold", color=INK)
         rows = self.figure.add_gridspec(2, 1, height_ratios=(3, 1.15))
         top = rows[0].subgridspec(1, 3 if trace.rewards else 2)
@@ -98,7 +100,7 @@ class _Board:
         frame = self.trace.episode.frames[0]
         height, width = frame.shape[-2:]
         axes.set(xticks=[], yticks=[])
-        return axes.imshow(frame.transpose(1, 2, 0), alpha=alpha, extent=(0, width, height, 0))
+        return axes.imshow(coloured(frame), alpha=alpha, extent=(0, width, height, 0))
 
     def _actions(self, axes: Axes) -> BarContainer:
         dress(axes, "Probability of actions", grid="x")
@@ -134,7 +136,7 @@ class _Board:
         action = int(episode.actions[step])
         self.title.set_text(f"Step {step + 1}: {self.names[action]}{ending}")
         for image in self.frames:
-            image.set_data(episode.frames[step].transpose(1, 2, 0))
+            image.set_data(coloured(episode.frames[step]))
         for number, bar in enumerate(self.bars):
             bar.set_width(self.trace.probabilities[step, number])
             bar.set_color(PALETTE[0] if number == action else RUNNING)

@@ -86,7 +86,7 @@ class SceneOptions:
         check_choice("split", self.split, SPLITS)
         check_choice("stream", self.stream, STREAMS)
         holdout_kinds(self.holdout)
-        at_least_one("max_steps", self.max_steps)
+        object.__setattr__(self, "max_steps", at_least_one("max_steps", self.max_steps))
 
     @property
     def shown_layout(self) -> Layout:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ifo_grounding.errors import UserError, check_below, check_choice, whole
 from ifo_grounding.keys import INSTRUCTION_LENGTH
+from ifo_grounding.texts import one_line
 
 PAD = 0
 MOST_WORDS = 512
@@ -47,6 +48,8 @@ class Vocabulary:
             raise UserError("a vocabulary must not hold a word twice")
         if bad := [word for word in words if word.lower().split() != [word]]:
             raise UserError(f"words must be lower case without spaces, got {bad[0]!r}")
+        if bad := [word for word in words if one_line(word) != word]:
+            raise UserError(f"words must be of characters that can be printed, got {bad[0]!r}")
 
     @functools.cached_property
     def _ids(self) -> dict[str, int]:
@@ -114,6 +117,15 @@ class Vocabulary:
         check_below("the vocabulary has no token", tokens, len(table))
         rows = tokens.reshape(-1, tokens.shape[-1]).tolist()
         return [" ".join(table[token] for token in row if token != PAD) for row in rows]
+
+
+def check_vocabulary(given: object) -> None:
+    """Refuse what is no vocabulary, such as a list of words."""
+    if not isinstance(given, Vocabulary):
+        raise UserError(
+            "vocabulary is a Vocabulary, such as that of the demonstrations or "
+            f"Vocabulary.from_sentences(...), got {type(given).__name__}"
+        )
 
 
 def words_of(sentence: str, punctuation: bool = False) -> list[str]:

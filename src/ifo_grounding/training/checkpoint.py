@@ -16,9 +16,11 @@ from typing import Any
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.files import atomic_write, unwritable
+from ifo_grounding.files import atomic_write, regular_file, unwritable
 
 FORMAT = "ifo-grounding checkpoint 2"
+HELD = {"settings": dict, "progress": dict, "seconds": float, "parts": dict}
+"""What a checkpoint holds besides its format."""
 
 
 def difference(
@@ -143,13 +145,16 @@ def spent(path: Path) -> float:
 def _read(path: Path) -> dict[str, Any]:
     """Return what a checkpoint file holds."""
     try:
-        with zipfile.ZipFile(path) as archive:  # PyTorch does not compare its checksums
+        with zipfile.ZipFile(
+            regular_file(path)
+        ) as archive:  # PyTorch does not compare its checksums
             if damaged := archive.testzip():
                 raise zipfile.BadZipFile(f"the checksum of {damaged} is another")
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # flipped bits raise whatever the reader stumbles over
         raise UserError(f"{path} is damaged ({_reason(error)}): delete it to start over") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    known = isinstance(content, dict) and content.get("format") == FORMAT
+    if not known or any(not isinstance(content.get(k), kind) for k, kind in HELD.items()):
         raise UserError(f"{path} is no checkpoint of this version: delete it to start over")
     return content
 

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, at_least_one, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice, share
 from ifo_grounding.keys import PIXELS, SUITABILITY
 from ifo_grounding.modules import device_of, evaluating, output_key
 from ifo_grounding.transforms.base import check_pool, flat_logit
@@ -201,7 +201,7 @@ class PoolScorer:
 def check_options(threshold: float, candidates: int, choose: str) -> None:
     """Raise :class:`UserError` where an option of the choice is impossible."""
     check_choice("choose", choose, CHOICES)
-    if not 0 <= threshold < 1:
+    if share("threshold", threshold) == 1:
         raise UserError(f"threshold is a probability in [0, 1), got {threshold}")
     at_least_one("candidates", candidates)
 

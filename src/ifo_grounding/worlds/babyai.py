@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ from ifo_grounding.data import Demonstrations, Truth, babyai, bot_outcomes, reco
 from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
 from ifo_grounding.envs import GymnasiumEnv, from_gymnasium
 from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.machine import cores
 from ifo_grounding.worlds.base import World
 
 
@@ -25,7 +25,7 @@ class BabyAI(World):
     tile_size: int = 8
     """Pixels along one side of a cell."""
     processes: int | None = None
-    """Processes that record the bot side by side; null takes every core."""
+    """Processes that record the bot side by side; null: all cores that this one may use."""
 
     def __post_init__(self) -> None:
         babyai(self.level, self.tile_size)  # refuses what is no level
@@ -55,7 +55,7 @@ class BabyAI(World):
 
     @property
     def _processes(self) -> int:
-        return self.processes or os.cpu_count() or 1
+        return self.processes or cores()
 
     def _rooms(self, mission: str, num_envs: int, **options: Any) -> GymnasiumEnv:
         if self.vocabulary is None:

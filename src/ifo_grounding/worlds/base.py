@@ -130,6 +130,7 @@ class World(ABC):
         if demos.image_shape != shown:
             raise UserError(
                 f"frames in {folder} are {list(demos.image_shape)}, those of the simulator "
-                f"{list(shown)}: make the world as it was recorded"
+                f"{list(shown)}: make the world as it was recorded, or read them yourself, scaled "
+                "(load_lerobot(size=...)), and save() what you read"
             )
         return demos
