@@ -1,17 +1,21 @@
 """Damaged files: every reader gives what was written, or says in one line what is wrong."""
 
+import contextlib
 import json
 import os
 import random
+from io import BytesIO
 from types import SimpleNamespace
 
 import pyarrow.dataset
 import pytest
 import torch
+from PIL import Image
 
 from comparing import all_frames
 from ifo_grounding.data import Demonstrations, load_pictures, record_demonstrations, save_pictures
 from ifo_grounding.data._episodes import read_table
+from ifo_grounding.data._images import stack_images
 from ifo_grounding.data.lerobot import load_lerobot, save_lerobot
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
@@ -161,6 +165,17 @@ def test_checkpoints_of_another_shape_are_refused(name, value, tmp_path):
     torch.save(content, tmp_path / "c.pt")
     with pytest.raises(UserError, match=r"is no checkpoint of this version"):
         restored(tmp_path)
+
+
+def test_no_changed_byte_of_a_png_changes_a_picture():
+    file = BytesIO()
+    frame = record_demonstrations("move", 1, seed=0)[0]["pixels"][1].permute(1, 2, 0).numpy()
+    Image.fromarray(frame).save(file, "PNG")
+    content = file.getvalue()
+    for at, old in enumerate(content):
+        changed = content[:at] + bytes([old ^ 64]) + content[at + 1 :]
+        with contextlib.suppress(UserError):
+            assert (stack_images([("a", changed)])[0].transpose(1, 2, 0) == frame).all(), at
 
 
 def test_a_pipe_in_place_of_json_does_not_hang(tmp_path):

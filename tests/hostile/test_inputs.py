@@ -108,7 +108,7 @@ def given(some):
         yield draw.choice(FORMS).replace("{}", name)
 
 
-@pytest.mark.parametrize("some", [1, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("some", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_options_are_taken_or_refused_in_one_line(some):
     for word in given(some):
         try:

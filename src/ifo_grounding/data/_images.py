@@ -38,8 +38,11 @@ Source = Image.Image | Path | bytes
 
 def open_image(source: Path | bytes) -> Image.Image:
     """Open a single image (of a photo, which may hold a preview too, the first) or raise BROKEN."""
-    given = regular_file(source) if isinstance(source, Path) else BytesIO(source)
-    image = Image.open(given, formats=FORMATS)
+    content = regular_file(source).read_bytes() if isinstance(source, Path) else source
+    image = Image.open(BytesIO(content), formats=FORMATS)
+    if image.format == "PNG":  # Pillow compares a PNG's checksums if asked to, and then opens anew
+        image.verify()
+        image = Image.open(BytesIO(content), formats=FORMATS)
     if image.format != "MPO" and (count := getattr(image, "n_frames", 1)) > 1:
         raise OSError(f"it holds {count} pictures: save them one by one")
     return image
