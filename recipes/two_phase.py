@@ -26,13 +26,14 @@ from ifo_grounding.config import STAGES, Options
 from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.report import text_table
 from ifo_grounding.report.results import conclusion, headline
+from ifo_grounding.texts import one_line
 from report import report
 
 
 def two_phase(options: Options) -> dict:
     last = STAGES.index(options.until or STAGES[-1])
     print(
-        f"{options.task}, {options.demonstrations.n:,} demonstrations: about "
+        f"{one_line(options.task)}, {options.demonstrations.n:,} demonstrations: about "
         f"{math.ceil(expected_minutes(options))} minutes of a core; what is interrupted goes on",
         flush=True,
     )

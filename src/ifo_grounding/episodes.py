@@ -81,7 +81,7 @@ def play(
     true_reward = keys.REWARD if keys.REWARD in env.reward_keys else env.reward_keys[0]
     state = start
     with set_exploration_type(MODES[mode]):
-        for _ in progress_bar(range(max_steps), "play", leave=False):
+        for _ in progress_bar(iter(range(max_steps)), "play", leave=False):
             state[env.action_key] = _actions(policy, env, state, active)
             stepped = env.step(state)
             transition = stepped.reshape(rows)[active]
