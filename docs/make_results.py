@@ -52,7 +52,7 @@ def over_continued(runs: Runs) -> str:
     return brief(difference(ran, "continued", "phase2")) + aside
 
 
-def few_rows() -> list[Row]:
+def few_rows(found: dict[tuple[str, int], Runs]) -> list[Row]:
     """Return the README's rows: what self-examination adds where demonstrations are few."""
     return [
         {
@@ -63,7 +63,7 @@ def few_rows() -> list[Row]:
             "after self-examination": success(runs, "phase2"),
             "difference, points": gain(runs),
         }
-        for (task, number), runs in runs_of("few", TASKS).items()
+        for (task, number), runs in found.items()
     ]
 
 
@@ -110,9 +110,11 @@ def minutes(runs: Runs) -> int:
 
 def tables() -> dict[str, str]:
     """Return every table by name."""
-    studied = study_rows()
+    studied, demo = study_rows(), runs_of("few", TASKS)
+    two_hundred = {key: runs for key, runs in runs_of("study", TASKS).items() if key[1] == 200}
     found: dict[str, list[Row]] = {
-        "few": few_rows(),
+        "demo": few_rows(demo),
+        "few": few_rows(demo | two_hundred),
         "results": [row for (_, number), row in studied.items() if number == 200],
         "up-to-2000": [row for (_, n), row in studied.items() if n <= 2000 and n != 200],
         "from-5000": [row for (_, number), row in studied.items() if number >= 5000],

@@ -87,7 +87,11 @@ def place(layer: str) -> int:
 
 
 def layers() -> list[str]:
-    entries = (path for path in PACKAGE.iterdir() if path.stem not in ("__init__", "__pycache__"))
+    entries = (
+        path
+        for path in PACKAGE.iterdir()
+        if path.stem not in ("__init__", "__pycache__", "pretrained")
+    )
     return sorted(path.stem for path in entries if path.is_dir() or path.suffix == ".py")
 
 

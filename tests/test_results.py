@@ -41,7 +41,7 @@ def test_every_table_of_the_pages_is_what_the_scripts_write():
 
 
 def test_every_result_says_where_it_comes_from():
-    folders = ("babyai", "study", "tables")
+    folders = ("babyai", "few", "study", "tables")
     found = [read_json(file) for of in folders for file in (ROOT / "results" / of).glob("*.json")]
     assert len(found) > 200
     for run in found:

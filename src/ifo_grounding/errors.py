@@ -145,3 +145,8 @@ def optional(module: str, extra: str) -> Any:
         return importlib.import_module(module)
     except ImportError:
         raise UserError(f"{module} is missing: pip install 'ifo-grounding[{extra}]'") from None
+
+
+def first_line(error: Exception) -> str:
+    """Return an error's kind and the first line of what it says."""
+    return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"

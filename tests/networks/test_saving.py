@@ -16,6 +16,7 @@ from torch import nn
 
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import success_rate
 from ifo_grounding.files import write_json
 from ifo_grounding.networks import (
     Shapes,
@@ -27,7 +28,7 @@ from ifo_grounding.networks import (
     save_pretrained,
 )
 from ifo_grounding.networks.saving import FORMAT
-from ifo_grounding.tasks import VOCABULARY, Vocabulary
+from ifo_grounding.tasks import TASKS, VOCABULARY, Vocabulary
 from networks.conftest import MAKERS, inputs, nested_keys
 
 SHAPES = Shapes((3, 16, 16), len(VOCABULARY), n_actions=3, tile_size=8)
@@ -283,3 +284,20 @@ def test_the_hub_gets_the_folder_in_one_commit(tmp_path, monkeypatch):
     assert sent["created"] == {"private": True, "exist_ok": True}
     with pytest.raises(TypeError, match="privat"):
         save_pretrained(policy, tmp_path, **to, privat=True)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_networks_that_come_with_the_package_do_their_task(task):
+    policy = from_pretrained(f"ifo-grounding/{task}")
+    env = PickAndPlaceEnv(task, num_envs=200)
+    assert success_rate(policy, env, episodes=200, seed=0, stream="validation").rate.rate > 0.95
+    for kind in ("instruction", "goal"):
+        network = from_pretrained(f"ifo-grounding/{task}", kind=kind)
+        assert network.network_config.kind == kind and network.vocabulary == policy.vocabulary
+
+
+def test_networks_that_do_not_come_with_the_package_are_named():
+    with pytest.raises(UserError, match=r"unknown network .*choose one of ifo-grounding/move, "):
+        from_pretrained("ifo-grounding/fly")
+    with pytest.raises(UserError, match=r"no network of kind 'value': choose one of goal, instr"):
+        from_pretrained("ifo-grounding/move", kind="value")

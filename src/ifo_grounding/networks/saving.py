@@ -15,11 +15,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from ifo_grounding.errors import UserError, optional
+from ifo_grounding.errors import UserError, first_line
 from ifo_grounding.files import atomic_write, read_json, regular_file, unwritable
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks import makers
 from ifo_grounding.networks.card import LIBRARY, card
+from ifo_grounding.networks.hub import CARD, OWN, WEIGHTS, WORDS, downloaded, own, upload
 from ifo_grounding.networks.makers import Blueprint
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.tasks.vocabulary import Vocabulary
@@ -33,11 +34,6 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "reward": makers.make_reward_model,
     "goal": makers.make_goal_classifier,
 }
-WEIGHTS = "network.safetensors"
-WORDS = "vocabulary.json"
-"""Words of a folder whose network does not hold them itself."""
-CARD = "README.md"
-FILES = [WEIGHTS, WORDS, CARD]
 MOST_BUFFERS = 1 << 28  # bytes that depend on the size of images, and on no weight
 
 
@@ -99,7 +95,7 @@ def load(
         raise  # says nothing against the file
     except (LookupError, TypeError, AttributeError, RuntimeError, ValueError) as error:
         raise UserError(
-            f"{path} does not fit this version of ifo-grounding ({_first_line(error)}): train the "
+            f"{path} does not fit this version of ifo-grounding ({first_line(error)}): train the "
             "network again"
         ) from None
     if (words := plan.get("vocabulary")) is not None:
@@ -150,7 +146,7 @@ def save_pretrained(
             temporary.write_text(card(plan, facts or {}), encoding="utf-8", errors="replace")
     _write(module, weights, vocabulary)
     if hub_id is not None:
-        _upload(folder, hub_id, **hub)
+        upload(folder, hub_id, **hub)
     return folder
 
 
@@ -163,23 +159,32 @@ def from_pretrained(
     """Load a network that :func:`save_pretrained` wrote, with its words as ``vocabulary``, or None.
 
     Args:
-        source: its folder, or ``user/name`` on the Hugging Face Hub (extra ``hub``).
-        kind: the kind that is expected, such as ``"policy"``; None allows any.
+        source: its folder, ``user/name`` on the Hugging Face Hub (extra ``hub``), or
+            ``ifo-grounding/TASK`` of those that come with the package: for each task a ``policy``,
+            an ``instruction`` and a ``goal`` classifier.
+        kind: the kind that is expected, such as ``"policy"``; None allows any, and takes the policy
+            of a task.
         hub: for ``huggingface_hub.snapshot_download``, such as ``revision``, ``cache_dir``,
             ``token`` or ``local_files_only``.
 
     Raises:
         UserError: where there is no such folder, here or on the Hub, or it holds no network of
             that kind, or its words are damaged or another network's.
+
+    >>> policy = from_pretrained("ifo-grounding/move")
+    >>> policy.vocabulary.decode(policy.vocabulary.encode(["move to the red circle"]))
+    ['move to the red circle']
     """
     folder = Path(source)
+    if str(source).startswith(f"{OWN}/") and not folder.exists():
+        folder = own(str(source), kind or "policy")
     if not folder.is_dir():
         if folder.exists() or str(source).count("/") != 1 or str(source)[0] in "./~":
             raise UserError(
                 f"{source} is no folder that save_pretrained wrote; on the Hub a network is called "
                 "user/name"
             )
-        folder = _downloaded(str(source), hub)
+        folder = downloaded(str(source), hub)
     module = load(folder / WEIGHTS, device=device, kind=kind)
     words = folder / WORDS
     if module.vocabulary is None and words.is_file():
@@ -211,7 +216,7 @@ def _write(module: nn.Module, path: Path, vocabulary: Vocabulary | None) -> str:
         with atomic_write(path) as temporary:
             save_file(weights, temporary, {**texts, "checksum": checksum})
     except (OSError, SafetensorError) as error:
-        raise unwritable(path, _first_line(error)) from error
+        raise unwritable(path, first_line(error)) from error
     return checksum
 
 
@@ -257,50 +262,13 @@ def _key(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
-
-
-def _upload(folder: Path, hub_id: str, private: bool | None = None, **options: Any) -> None:
-    """Send the files of a network in one commit; those of another that was there go with it."""
-    hub = optional("huggingface_hub", extra="hub")
-    api = hub.HfApi(token=options.pop("token", None))
-    try:
-        repo = api.create_repo(hub_id, private=private, exist_ok=True)
-        api.upload_folder(
-            repo_id=repo.repo_id,
-            folder_path=folder,
-            allow_patterns=FILES,
-            delete_patterns=[WORDS],
-            **options,
-        )
-    except TypeError:  # an option that there is not
-        raise
-    except Exception as error:  # the client's and those of its transport, which share no base
-        raise UserError(
-            f"{hub_id} could not be sent to the Hugging Face Hub ({_first_line(error)}): mend the "
-            "name or the connection, or log in with `hf auth login`"
-        ) from None
-
-
-def _downloaded(hub_id: str, options: dict[str, Any]) -> Path:
-    hub = optional("huggingface_hub", extra="hub")
-    try:
-        return Path(hub.snapshot_download(hub_id, allow_patterns=FILES, **options))
-    except (OSError, ValueError) as error:  # what all errors of the Hub are
-        raise UserError(
-            f"{hub_id} is neither a folder nor a repository of the Hugging Face Hub that can be "
-            f"reached ({_first_line(error)}): mend the name, or the connection"
-        ) from None
-
-
 def _vocabulary(found: Any, shapes: Shapes, path: str | Path) -> Vocabulary:
     """Return words as JSON has them, or refuse what is damaged or another network's."""
     try:
         vocabulary = Vocabulary(found["words"], found["length"])
     except (TypeError, KeyError, AttributeError, UserError) as error:
         raise UserError(
-            f"{path} holds no words ({_first_line(error)}): restore it, or save the network again "
+            f"{path} holds no words ({first_line(error)}): restore it, or save the network again "
             "with its vocabulary"
         ) from None
     _check_fit(vocabulary, shapes, str(path))
