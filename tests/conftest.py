@@ -22,6 +22,7 @@ def _seeds():
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002  the global generator is what other libraries read
     torch.manual_seed(0)
+    torch.set_flush_denormal(False)  # a run that a test before began in this process flushes them
 
 
 @pytest.fixture(autouse=True)

@@ -135,7 +135,7 @@ def make_policy(
         UserError: for an environment of one-hot actions.
 
     >>> policy = make_policy(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
-    >>> image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), torch.ones(2, 16)
+    >>> image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), torch.ones(2, 16).long()
     >>> logits, action, log_prob = policy(pixels=image, instruction=words)
     >>> logits.shape, action.shape, log_prob.shape
     (torch.Size([2, 6]), torch.Size([2]), torch.Size([2]))
@@ -184,7 +184,7 @@ def make_value(
 
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
     >>> value = make_value(shapes, init_from=make_policy(shapes, seed=0), seed=0)
-    >>> value(pixels=torch.zeros(2, 3, 48, 48), instruction=torch.ones(2, 16)).shape
+    >>> value(pixels=torch.zeros(2, 3, 48, 48), instruction=torch.ones(2, 16).long()).shape
     torch.Size([2, 1])
     """
     options = {"in_keys": in_keys, "out_key": out_key}
@@ -263,7 +263,7 @@ def make_goal_classifier(
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
     >>> classifier = make_goal_classifier(shapes, seed=0)
     >>> frame = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
-    >>> classifier(initial_pixels=frame, pixels=frame, instruction=torch.ones(2, 16)).shape
+    >>> classifier(initial_pixels=frame, pixels=frame, instruction=torch.ones(2, 16).long()).shape
     torch.Size([2, 1])
     """
     options = {"in_keys": in_keys, "out_key": out_key}
@@ -297,7 +297,7 @@ def make_reward_model(
             this has to know as much.
 
     >>> rwd = make_reward_model(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
-    >>> image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), torch.ones(2, 16)
+    >>> image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), torch.ones(2, 16).long()
     >>> rwd(pixels=image, instruction=words, action=torch.tensor([0, 5])).shape
     torch.Size([2, 1])
     """
