@@ -29,7 +29,7 @@ test-slow: $(DEV) ## tests that train for minutes
 
 test-browser: $(DEV) ## tests that open pages in headless Chromium: the system's, or Playwright's own
 	command -v chromium chromium-browser >/dev/null || $(BIN)/playwright install chromium
-	OMP_NUM_THREADS=1 $(BIN)/pytest -m browser tests/browser $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m "browser and not slow" tests/browser $(ARGS)
 
 test-gpu: $(DEV) ## tests that need a GPU, and those that pretend one where there is none
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m gpu $(ARGS)

@@ -17,6 +17,9 @@ from test_docs import ROOT
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(1200)]
 
 FLAGS = ["--no-sandbox", "--disable-background-networking", "--disable-component-update"]
+FLAGS += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]  # no other machine is found
+SOME = ("", "phase2", "table-2", "speed", "own-world")
+"""Pages with equations, wide tables, pictures and code."""
 SCREENS = {"desktop": (1280, 900), "phone": (390, 844)}
 
 
@@ -47,16 +50,17 @@ def opened(request, site):
         page = browser.new_page(viewport={"width": width, "height": height}, base_url=site[1])
         page.asked, page.complaints = [], []
         page.on("request", lambda request: page.asked.append(request.url))
-        page.route(lambda url: not url.startswith(site[1]), lambda route: route.abort())
         page.on("console", lambda message: page.complaints.append(message.text))
         page.on("pageerror", lambda error: page.complaints.append(str(error)))
         yield page
         browser.close()
 
 
-def test_every_page_is_whole_without_a_network(opened, site):
+@pytest.mark.parametrize("which", ["some", pytest.param("all", marks=pytest.mark.slow)])
+def test_pages_are_whole_without_a_network(opened, site, which):
     equations = 0
-    for index in sorted(site[0].rglob("index.html")):
+    every = sorted(site[0].rglob("index.html"))
+    for index in every if which == "all" else [site[0] / page / "index.html" for page in SOME]:
         opened.goto(index.parent.relative_to(site[0]).as_posix() + "/")
         opened.wait_for_function("[...document.images].every(image => image.complete)")
         assert opened.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, index
@@ -65,7 +69,7 @@ def test_every_page_is_whole_without_a_network(opened, site):
         drawn, found = opened.locator(".katex-html").count(), opened.locator(".arithmatex").count()
         assert drawn == found, f"{index}: {found} equations, {drawn} drawn"
         equations += drawn
-    assert equations > 30
+    assert equations > 10
     assert [url for url in opened.asked if not url.startswith(site[1])] == []
     assert opened.complaints == []
 
