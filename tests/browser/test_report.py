@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import io
-import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
+from browser.conftest import SCREENS, new_tab
 from ifo_grounding.options import options_of
 from importing import recipes_importable
 
 pytestmark = pytest.mark.browser
 
-SCREENS = {"desktop": (1280, 900), "phone": (390, 844)}
 TEXTS = """[...document.querySelectorAll('main *')]
     .filter(part => [...part.childNodes].some(n => n.nodeType == 3 && n.textContent.trim()))"""
-FLAGS = ["--no-sandbox", "--disable-background-networking", "--disable-component-update"]
 
 
 @pytest.fixture(scope="module")
@@ -37,34 +34,17 @@ def page_of_a_run(tmp_path_factory):
         return report(options)
 
 
-@pytest.fixture(scope="module")
-def browser():
-    """The system's Chromium; Playwright's own where there is none."""
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=program, args=FLAGS)
-        yield opened
-        opened.close()
-
-
 @pytest.fixture(params=[(s, c) for s in SCREENS for c in ("light", "dark")], ids="-".join)
 def opened(request, browser, page_of_a_run):
     """The report on one screen in one colour scheme, and what it asked for and complained of."""
     screen, scheme = request.param
-    width, height = SCREENS[screen]
-    context = browser.new_context(
-        viewport={"width": width, "height": height}, color_scheme=scheme, offline=True
-    )
-    page = context.new_page()
-    page.asked, page.complaints, page.scheme = [], [], scheme
-    page.on("request", lambda request: page.asked.append(request.url))
-    page.on("console", lambda message: page.complaints.append(message.text))
-    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    page = new_tab(browser, screen, color_scheme=scheme, offline=True)
+    page.scheme = scheme
     page.goto(page_of_a_run.as_uri())
     page.evaluate("document.querySelectorAll('details').forEach(part => part.open = true)")
     page.wait_for_function("[...document.images].every(image => image.complete)")
     yield page
-    context.close()
+    page.context.close()
 
 
 def test_it_needs_no_network_and_shows_every_picture(opened, page_of_a_run):

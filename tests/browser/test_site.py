@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import functools
 import http.server
-import shutil
 import threading
 
 import pytest
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
-from playwright.sync_api import sync_playwright
 
+from browser.conftest import SCREENS, new_tab
 from test_docs import ROOT
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(1200)]
 
-FLAGS = ["--no-sandbox", "--disable-background-networking", "--disable-component-update"]
-FLAGS += ["--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"]  # no other machine is found
 SOME = ("", "phase2", "table-2", "speed", "own-world")
 """Pages with equations, wide tables, pictures and code."""
-SCREENS = {"desktop": (1280, 900), "phone": (390, 844)}
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -41,19 +37,11 @@ def site(tmp_path_factory):
 
 
 @pytest.fixture(params=SCREENS)
-def opened(request, site):
+def opened(request, browser, site):
     """A tab on one screen, what it asked of other machines and what it complained of."""
-    width, height = SCREENS[request.param]
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=FLAGS)
-        page = browser.new_page(viewport={"width": width, "height": height}, base_url=site[1])
-        page.asked, page.complaints = [], []
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.on("console", lambda message: page.complaints.append(message.text))
-        page.on("pageerror", lambda error: page.complaints.append(str(error)))
-        yield page
-        browser.close()
+    page = new_tab(browser, request.param, base_url=site[1])
+    yield page
+    page.context.close()
 
 
 @pytest.mark.parametrize("which", ["some", pytest.param("all", marks=pytest.mark.slow)])

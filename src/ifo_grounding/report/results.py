@@ -109,17 +109,17 @@ def headline(results: Mapping[str, Any]) -> dict[str, Any]:
 
 def conclusion(results: Mapping[str, Any]) -> str:
     """Return in one sentence what a run found; results as for :func:`results_rows`."""
-    found = list(headline(results).values())
-    before = percent(found[0])
-    if "phase2" not in results:
+    names = [name for name in ("phase1", "phase2") if name in results]
+    before, *after = (percent(restored(Rate, results[name]["rate"])) for name in names)
+    if not after:
         return f"Imitation does what it is told in {before} of the scenes; there is no phase 2."
     if results["phase2"] == results["phase1"]:
         return f"No checkpoint of phase 2 beat imitation, which is kept: {before} of the scenes."
-    after, gain = percent(found[1]), found[2]
+    gain = restored(Difference, results["gain"])
     chance = "; the difference may be chance" if gain.low <= 0 <= gain.high else ""
     return (
         f"Imitation does what it is told in {before} of unseen scenes; after practice on its own "
-        f"signals alone, the agent does in {after}{chance}."
+        f"signals alone, the agent does in {after[0]}{chance}."
     )
 
 
