@@ -20,7 +20,7 @@ from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport
 from ifo_grounding.errors import UserError
-from ifo_grounding.files import read_json, write_json
+from ifo_grounding.files import read_json, write_json, write_record
 from ifo_grounding.machine import choose_threads, machine_of
 from ifo_grounding.options import plain
 from ifo_grounding.progress import tell_progress
@@ -208,7 +208,7 @@ def decode_on(device: str, buffer: Any) -> None:
 
 def checksums(run: Run) -> dict[str, str]:
     """Return the checksums of the networks that a run has trained."""
-    return read_json(run / CHECKSUMS) if (run / CHECKSUMS).exists() else {}
+    return read_json(run / CHECKSUMS, dict) if (run / CHECKSUMS).exists() else {}
 
 
 def save_network(run: Run, name: str, network: Any) -> None:
@@ -282,7 +282,7 @@ def write_result(options: Options, results: dict[str, Any], name: str) -> dict[s
         "provenance": provenance(),
         "results": results,
     }
-    write_json(run / "result.json", content)
+    write_record(run / "result.json", content)
     if options.results:
         file = result_file(options)
         kept = read_json(file, dict, ["options"])["options"] if file.exists() else plain(options)

@@ -20,9 +20,8 @@ from evaluate import evaluate, played
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
-from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import record_episodes, trace_episode
-from ifo_grounding.files import read_json
+from ifo_grounding.files import read_record
 from ifo_grounding.report import (
     animation,
     provenance,
@@ -111,7 +110,7 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
 def made_by(run: Run) -> dict[str, Any]:
     """Return command and version, and how long each stage took."""
     path, known = run / "result.json", provenance()
-    how = read_json(path, dict, ["command"])["command"] if path.exists() else command("report")
+    how = read_record(path)["command"] if path.exists() else command("report")
     version = " ".join(str(known[name]) for name in ("version", "commit") if known[name])
     took = {name: f"{record['seconds']:,.0f} s" for name, record in run.records().items()}
     return {"command": how, "version": version, **took}
@@ -169,11 +168,7 @@ def curves(run: Run) -> dict[str, Any]:
     """Plot what was logged, stage by stage; what was not finite was kept as null."""
     found: dict[str, Any] = {}
     for stage, (title, wanted) in CURVES.items():
-        path = run / "metrics" / f"{stage}.json"
-        if path.exists():
-            metrics = read_json(path, list)
-            if not all(isinstance(row, dict) for row in metrics):
-                raise UserError(f"{path} holds no metrics: delete it or restore it")
+        if metrics := run.metrics(stage):
             found[title] = training_curves(metrics, wanted)
             if stage == "self_examine":
                 title = "Learned return and true success (validation scenes)"

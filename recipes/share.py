@@ -15,7 +15,7 @@ from _shared import (
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
-from ifo_grounding.files import read_json
+from ifo_grounding.files import read_record
 from ifo_grounding.networks import save_pretrained
 from ifo_grounding.report import results_rows
 from ifo_grounding.training import Run
@@ -54,7 +54,7 @@ def card_facts(run: Run, options: Options) -> dict[str, object]:
         "Seed": options.seed,
     }
     if (run / "result.json").exists():
-        written = read_json(run / "result.json", dict, ["results", "command", "provenance"])
+        written = read_record(run / "result.json")
         rows = results_rows(written["results"])
         facts |= {row["measured"]: row["result [95% interval]"] for row in rows}
         facts["Command"] = f"`{written['command']}`"

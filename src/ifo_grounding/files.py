@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import json
 import math
 import os
@@ -132,3 +133,21 @@ def read_json(path: str | Path, kind: Any = object, keys: Collection[str] = ()) 
         raise UserError(f"{path} cannot be read ({error})") from None
     except (ValueError, RecursionError) as error:  # no JSON, no text, too deep or too long
         raise UserError(f"{path} is not valid JSON ({error}): delete it or restore it") from None
+
+
+def write_record(path: str | Path, content: Mapping[str, Any]) -> None:
+    """Write a dict as JSON with a digest of it, by which :func:`read_record` notices changes."""
+    content = json.loads(json.dumps(_finite(content)))  # as it will be read
+    write_json(path, {**content, "digest": _digest(content)})
+
+
+def read_record(path: str | Path) -> dict[str, Any]:
+    """Read what :func:`write_record` wrote, or refuse what was changed since."""
+    content: dict[str, Any] = read_json(path, dict, ["digest"])
+    if content.pop("digest") != _digest(content):
+        raise UserError(f"{path} was changed since it was written: delete it or restore it")
+    return content
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]

@@ -151,7 +151,9 @@ def read_table(table: Any, **chosen: Any) -> Any:
         for batch in table.to_batches(batch_size=256, **chosen):
             read.append(batch)
             check_size(sum(part.num_rows for part in read), sum(part.nbytes for part in read))
-        return arrow.Table.from_batches(read)
+        found = arrow.Table.from_batches(read)
+        found.validate(full=True)  # of text that lies outside of its column an error shows 500 MB
+        return found
     except arrow.ArrowException as error:  # some are no errors of Python's own kinds
         raise OSError(error) from None
 

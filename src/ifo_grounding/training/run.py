@@ -18,7 +18,15 @@ from typing import Any
 import torch
 
 from ifo_grounding.errors import UserError, check_choice
-from ifo_grounding.files import atomic_write, home, read_json, remove_leftovers, write_json
+from ifo_grounding.files import (
+    atomic_write,
+    home,
+    read_json,
+    read_record,
+    remove_leftovers,
+    write_json,
+    write_record,
+)
 from ifo_grounding.machine import processor
 from ifo_grounding.training.checkpoint import difference, spent
 from ifo_grounding.training.loop import Log, Metrics
@@ -33,6 +41,7 @@ NOT_TAKEN = (OPTIONS, "logs", "checkpoints", "report", "result.json", ".*")
 """What :meth:`Run.take_over` never copies."""
 WRITTEN = ("stages", "metrics", "logs", "report", "report/pictures", "checkpoints/*")
 """Folders in a run's folder in which files are written."""
+NUMBERS = (int, float)
 _HELD: set[Path] = set()
 """Folders of the runs that this process has locked."""
 
@@ -165,7 +174,22 @@ class Run:
     def record(self, name: str) -> dict[str, Any]:
         """Return what a stage left when it was done, empty where it was not."""
         path = self._record_path(name)
-        return read_json(path, dict, ["result", "seconds"]) if path.exists() else {}
+        return read_record(path) if path.exists() else {}
+
+    def metrics(self, name: str) -> list[Metrics]:
+        """Return the metrics of each iteration of a stage that is done, with their ``step``.
+
+        Raises:
+            UserError: where the file holds anything else.
+        """
+        path = self / f"metrics/{name}.json"
+        rows = read_json(path, list) if path.exists() else []
+        for row in rows:
+            values = list(row.values()) if isinstance(row, dict) else [""]
+            numbers = all(value is None or type(value) in NUMBERS for value in values)
+            if not numbers or type(row.get("step")) not in NUMBERS:
+                raise UserError(f"{path} holds no metrics: delete it or restore it")
+        return rows
 
     def records(self) -> dict[str, dict[str, Any]]:
         """Return what each stage that is done left."""
@@ -256,7 +280,7 @@ class Stage:
             write_json(self.run / f"metrics/{self.name}.json", list(history))
         record = {"result": result, "seconds": seconds, "machine": machine or processor()}
         record["threads"] = torch.get_num_threads()
-        write_json(self.run._record_path(self.name), record)
+        write_record(self.run._record_path(self.name), record)
         self._drop_checkpoints()
         self.result = result
         return result

@@ -90,12 +90,13 @@ class PoolScorer:
         with evaluating(self.classifier):
             return network.encode_scenes(pixels.to(device))
 
-    def score(self, states: Any, index: Tensor) -> Tensor:
+    def score(self, states: Any, index: Tensor, words: Tensor | None = None) -> Tensor:
         """Score candidates.
 
         Args:
             states: B encoded states, from :meth:`encode`.
             index: candidates of each state in the pool, int64 [B, K].
+            words: the encoded pool, where one has asked for it already (:meth:`words`).
 
         Returns:
             Logits, float32 [B, K] on the device of ``index``.
@@ -107,12 +108,12 @@ class PoolScorer:
         rows = max(1, len(index) if whole else AT_ONCE // max(1, index.shape[1]))
         with evaluating(self.classifier):
             some = [slice(begin, begin + rows) for begin in range(0, len(index), rows)]
-            parts = [self._candidates(states[part], index[part].to(device)) for part in some]
+            words = self.words(device) if words is None else words
+            parts = [self._candidates(states[part], index[part].to(device), words) for part in some]
         return torch.cat(parts).to(index.device)
 
-    def _candidates(self, states: Any, index: Tensor) -> Tensor:
+    def _candidates(self, states: Any, index: Tensor, words: Tensor | None) -> Tensor:
         if (network := self.network) is not None:
-            words = self.encodings(network, index.device)
             logit = network.score_candidates(states, words, index)
         else:
             pairs = TensorDict({}, batch_size=[index.numel()], device=index.device)
@@ -121,8 +122,13 @@ class PoolScorer:
             logit = self.classifier(pairs).get(self.logit_key)
         return flat_logit(logit, index.numel(), self.logit_key).view(index.shape)
 
-    def encodings(self, network: Any, device: torch.device) -> Tensor:
-        """Encode the pool, or return what was kept if no weight has changed since."""
+    def words(self, device: torch.device) -> Tensor | None:
+        """Encode the pool, or return what was kept if no weight has changed since.
+
+        None where the network does not encode instructions apart.
+        """
+        if (network := self.network) is None:
+            return None
         weights = [*self.classifier.parameters(), *self.classifier.buffers()]
         # Values are compared, not version counters: updates through `.data` or from another
         # process do not count.
@@ -177,10 +183,12 @@ class PoolScorer:
         waiting = torch.arange(len(pixels), device=pixels.device)
         states = self.encode(pixels) if len(pixels) else pixels
         home = device_of(self.classifier) or pixels.device
+        with evaluating(self.classifier):
+            words = self.words(home) if len(pixels) else None  # weights stay as they are in here
         begin = 0
         while len(waiting) and begin < index.shape[1]:
             candidates = index[waiting, begin : begin + look]
-            logits = self.score(states[waiting.to(home)], candidates)
+            logits = self.score(states[waiting.to(home)], candidates, words)
             suitable = logits > limit
             found = suitable.any(1)
             place = logits.argmax(1)

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.seeding import generator
@@ -165,6 +166,8 @@ class InstructionSampler(InstructionTransform):
         mask[rows.cpu()] = True
         mask = mask.to(done.device).view(*tensordict_reset.batch_size, 1).expand(done.shape)
         request.set(self.reset_key, mask.clone())
+        if isinstance(parent, TransformedEnv) and not len(parent.transform):
+            parent = parent.base_env  # which need not choose between old and new pixel by pixel
         return parent.reset(request, select_reset_only=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
