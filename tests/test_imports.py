@@ -26,7 +26,7 @@ ORDER = (
     ("training",),
     ("stats", "evaluation"),
     ("report",),
-    ("worlds",),
+    ("worlds", "baselines"),
     ("config", "cli"),
     ("options", "__main__"),
 )

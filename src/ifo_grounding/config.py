@@ -12,8 +12,10 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from ifo_grounding.baselines.config import METHODS, BaselineConfig
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range, whole
 from ifo_grounding.machine import check_device
+from ifo_grounding.networks.config import NetworksConfig
 from ifo_grounding.seeding import STREAMS
 from ifo_grounding.training.run import LOGGERS
 from ifo_grounding.training.self_examination import SelfExaminationConfig
@@ -34,6 +36,7 @@ STAGES = (
 FREE = (
     *("run", "base", "until", "results", "variant", "to", "hub", "controls.run", "references"),
     *("device", "threads", "logger", "progress", "checkpoint_seconds", "evaluate"),
+    *("method", "baseline"),
 )
 """Options, or sections, that decide nothing of what a run learns: they may change as it goes on."""
 
@@ -236,30 +239,6 @@ class ControlsConfig:
 
 
 @dataclass
-class NetworksConfig:
-    """Values of ``networks.NetworkConfig`` for all networks of a run; null leaves the preset's."""
-
-    features: int | None = None
-    """Channels of the feature map."""
-    dropout: float | None = None
-    """Dropout rate before each linear layer of the head."""
-    sentence_rate: float | None = None
-    """How fast the GRU and the gates learn, by the rest (``paper``)."""
-    sentence_pooling: str | None = None
-    """States of the GRU that make an encoded sentence: ``mean`` or ``last`` (``paper``)."""
-
-    def __post_init__(self) -> None:
-        check_range(self, "features", least=1, most=4096)
-        check_range(self, "dropout", least=0, most=0.999)
-        check_range(self, "sentence_rate", above=0, most=1000)
-        check_choice("sentence_pooling", self.sentence_pooling, (None, "last", "mean"))
-
-    def changed(self) -> dict[str, Any]:
-        """Return the values that are not the preset's."""
-        return {name: value for name, value in vars(self).items() if value is not None}
-
-
-@dataclass
 class Options:
     """All options; each recipe reads those that concern it."""
 
@@ -292,6 +271,9 @@ class Options:
     """What is special about the run, for the name of that file."""
     references: bool = False
     """Whether ``demo`` also imitates the demonstrator's true actions, to compare with."""
+    method: str = "ours"
+    """Of ``run baselines``: ``bc``, ``bco``, ``gail``, ``gail+bc``, ``gaifo``, ``agile``,
+    ``agile-chosen``, ``ours``, ``random`` or ``expert``."""
     to: str = "shared"
     """Folder to which ``share`` writes the networks."""
     hub: str | None = None
@@ -315,10 +297,12 @@ class Options:
     self_examine: SelfExamineConfig = field(default_factory=SelfExamineConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     controls: ControlsConfig = field(default_factory=ControlsConfig)
+    baseline: BaselineConfig = field(default_factory=BaselineConfig)
 
     def __post_init__(self) -> None:
         check_choice("logger", self.logger, LOGGERS)
         check_choice("until", self.until, (None, *STAGES))
+        check_choice("method", self.method, METHODS)
         if self.threads != "auto":
             whole("threads", self.threads)
             check_range(self, "threads", least=1, most=1024)

@@ -117,3 +117,27 @@ SPECIAL: dict[tuple[str, str], dict[str, Any]] = {
     ("strong", "inverse"): {"features": 32, "context": 2},
 }
 """Values of one kind of network."""
+
+
+@dataclass
+class NetworksConfig:
+    """Values of ``networks.NetworkConfig`` for all networks of a run; null leaves the preset's."""
+
+    features: int | None = None
+    """Channels of the feature map."""
+    dropout: float | None = None
+    """Dropout rate before each linear layer of the head."""
+    sentence_rate: float | None = None
+    """How fast the GRU and the gates learn, by the rest (``paper``)."""
+    sentence_pooling: str | None = None
+    """States of the GRU that make an encoded sentence: ``mean`` or ``last`` (``paper``)."""
+
+    def __post_init__(self) -> None:
+        check_range(self, "features", least=1, most=4096)
+        check_range(self, "dropout", least=0, most=0.999)
+        check_range(self, "sentence_rate", above=0, most=1000)
+        check_choice("sentence_pooling", self.sentence_pooling, (None, "last", "mean"))
+
+    def changed(self) -> dict[str, Any]:
+        """Return the values that are not the preset's."""
+        return {name: value for name, value in vars(self).items() if value is not None}

@@ -5,7 +5,11 @@ from ifo_grounding.training.checkpoint import Checkpoint
 from ifo_grounding.training.pairs import select_pairs
 from ifo_grounding.training.run import Run, Stage
 from ifo_grounding.training.selection import BestCheckpoint, EarlyStopping, HeldOutAccuracy
-from ifo_grounding.training.self_examination import SelfExaminationConfig, self_examine
+from ifo_grounding.training.self_examination import (
+    SelfExaminationConfig,
+    improve_policy,
+    self_examine,
+)
 from ifo_grounding.training.supervised import FitConfig, fit
 from ifo_grounding.training.trials import Trial, successive_halving, trial_seed
 
@@ -22,6 +26,7 @@ __all__ = [
     "Stage",
     "Trial",
     "fit",
+    "improve_policy",
     "select_pairs",
     "self_examine",
     "successive_halving",

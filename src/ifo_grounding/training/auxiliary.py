@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding.errors import check_range
@@ -41,6 +42,21 @@ class AuxiliaryImitation:
         """Return the weighted loss of a batch of demonstrations, a scalar."""
         batch = beside(self.buffer.sample(self.batch_size), self.loss)
         return self.weight * self.loss(batch)["loss_imitation"]
+
+
+class Adversarial(Protocol):
+    """What learns a reward on while the policy improves, and is kept in checkpoints."""
+
+    @property
+    def loss(self) -> nn.Module:
+        """What is minimised; it holds the network."""
+
+    @property
+    def optimizer(self) -> torch.optim.Optimizer:
+        """What minimises it."""
+
+    def __call__(self, batch: TensorDictBase) -> Metrics:
+        """Train on the policy's steps [N, T] and return metrics."""
 
 
 class AdversarialUpdates:

@@ -17,7 +17,7 @@ from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.attributes import first_worker, untransformed
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.seeding import derive
-from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
+from ifo_grounding.training.auxiliary import Adversarial, AuxiliaryImitation
 from ifo_grounding.training.checkpoint import Checkpoint
 from ifo_grounding.training.loop import Log, Loop, Metrics
 from ifo_grounding.training.policy_gradient import Learner
@@ -96,9 +96,38 @@ def self_examine(
     policy: ProbabilisticTensorDictSequential,
     value: TensorDictModuleBase,
     config: SelfExaminationConfig,
+    **options: Any,
+) -> list[Metrics]:
+    """Improve the phase-1 policy in place by policy gradient on learned rewards.
+
+    Returns the metrics of each iteration.
+
+    Args:
+        env: batched, without true instructions and rewards; its transforms choose instructions
+            and write ``("next", "learned_reward")``.
+        policy: the phase-1 policy, a ``ProbabilisticActor``.
+        value: estimates the learned return.
+        options: for :func:`improve_policy`: ``seed`` and what else it takes.
+
+    Raises:
+        UserError: where the env exposes its true state or its own instructions, and as of
+            :func:`improve_policy`.
+    """
+    if exposes_state(env):
+        raise UserError("self-examination never sees the true state: use expose_state=False")
+    if instructs(env):
+        raise UserError("self-examination never sees true instructions: use instructed=False")
+    return improve_policy(env, policy, value, config, **options)
+
+
+def improve_policy(
+    env: EnvBase,
+    policy: ProbabilisticTensorDictSequential,
+    value: TensorDictModuleBase,
+    config: SelfExaminationConfig,
     *,
     seed: int,
-    adversarial: AdversarialUpdates | None = None,
+    adversarial: Adversarial | None = None,
     imitation: AuxiliaryImitation | None = None,
     held_out: HeldOutAccuracy | None = None,
     checkpoint: str | Path | None = None,
@@ -107,15 +136,15 @@ def self_examine(
     callback: Callable[[int], Metrics] | None = None,
     progress: bool = False,
 ) -> list[Metrics]:
-    """Improve ``policy`` in place by policy gradient on learned rewards.
+    """Improve ``policy`` in place by policy gradient on learned rewards, wherever it may step.
 
     Returns the metrics of each iteration.
 
     Args:
-        env: batched, without true instructions and rewards; its transforms choose instructions
-            and write ``("next", "learned_reward")``. They are seeded anew each iteration, but for
-            those inside the workers of a ``SerialEnv`` or ``ParallelEnv``.
-        policy: the phase-1 policy, a ``ProbabilisticActor``.
+        env: batched; its transforms write ``("next", "learned_reward")`` and, where it has none,
+            instructions. They are seeded anew each iteration, but for those inside the workers of a
+            ``SerialEnv`` or ``ParallelEnv``. What the env itself pays is not read.
+        policy: a ``ProbabilisticActor``.
         value: estimates the learned return.
         seed: all randomness is a function of it and of the iteration, which starts from a reset.
         adversarial: trains the reward model on, with the steps of each iteration.
@@ -127,8 +156,8 @@ def self_examine(
         callback: gets the iteration, returns further metrics; the place for audits.
 
     Raises:
-        UserError: where the env exposes its true state, or has no learned reward, where ``policy``
-            is no actor, or where the best one is to be selected with ``adversarial`` but without
+        UserError: where the env has no instructions or no learned reward, where ``policy`` is no
+            actor, or where the best one is to be selected with ``adversarial`` but without
             ``held_out``.
     """
     if not isinstance(policy, ProbabilisticTensorDictSequential):
@@ -188,14 +217,10 @@ def self_examine(
 def _check(
     env: EnvBase,
     config: SelfExaminationConfig,
-    adversarial: AdversarialUpdates | None,
+    adversarial: Adversarial | None,
     held_out: HeldOutAccuracy | None,
 ) -> None:
-    """Refuse an env that leaks or lacks something, and a selection that is impossible."""
-    if exposes_state(env):
-        raise UserError("self-examination never sees the true state: use expose_state=False")
-    if instructs(env):
-        raise UserError("self-examination never sees true instructions: use instructed=False")
+    """Refuse an env that lacks something, and a selection that is impossible."""
     observed = env.observation_spec.keys(True, True)
     if keys.INSTRUCTION not in observed:
         raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")

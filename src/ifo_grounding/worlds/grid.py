@@ -15,6 +15,7 @@ from ifo_grounding.data import Demonstrations, Truth, record_demonstrations
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Endings, SuitabilityResult, episode_endings, suitable_rate
+from ifo_grounding.seeding import derive
 from ifo_grounding.tasks import VOCABULARY, grammar
 from ifo_grounding.world import Layout
 from ifo_grounding.worlds.base import World
@@ -79,6 +80,15 @@ class Grid(World):
     def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
         """Return the expert's success: it never fails."""
         return torch.ones(episodes, dtype=torch.bool)
+
+    def steppable(self, num_envs: int, *, seed: int, **options: Any) -> PickAndPlaceEnv:
+        """Return worlds whose scene number i is the first state of demonstration i of a seed.
+
+        For methods that may step from demonstrations' states, as ours may not.
+        """
+        return PickAndPlaceEnv(
+            self.task, num_envs, seed=derive(seed, "demonstrations"), **self.scenes(**options)
+        )
 
     def read(self, folder: str | Path, progress: bool = False) -> Demonstrations:
         """Read demonstrations that were recorded elsewhere, of this task."""

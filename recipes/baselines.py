@@ -1,0 +1,222 @@
+"""A rival of the paper's Table 1, with exactly the access it is allowed.
+
+python recipes/baselines.py method=agile task=pick
+"""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import torch
+from _shared import (
+    POLICIES,
+    REFERENCE,
+    TRUTH,
+    build,
+    finish,
+    load_demonstrations,
+    load_network,
+    open_stage,
+    plain,
+    save_network,
+    simulator_of,
+    tell,
+    world_of,
+    write_result,
+)
+from evaluate import measured_success, played, success_results
+from references import imitate_truth
+from self_examine import chosen_starts
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
+from two_phase import stages_of
+
+from ifo_grounding import keys
+from ifo_grounding.baselines import (
+    AGILE,
+    GAIL,
+    ActionDemonstrations,
+    Adversary,
+    ChosenAGILE,
+    GAIfO,
+    SteppableDemonstrations,
+)
+from ifo_grounding.baselines.config import METHODS
+from ifo_grounding.cli import recipe_main
+from ifo_grounding.config import STAGES, Options
+from ifo_grounding.data import Truth
+from ifo_grounding.errors import UserError
+from ifo_grounding.evaluation import success_rate
+from ifo_grounding.networks import make_policy, make_value
+from ifo_grounding.report.results import by_scene
+from ifo_grounding.training import Run, improve_policy
+
+ADVERSARIES: dict[str, type[Adversary]] = {
+    "gail": GAIL,
+    "gail+bc": GAIL,
+    "gaifo": GAIfO,
+    "agile": AGILE,
+    "agile-chosen": ChosenAGILE,
+}
+
+
+def baseline(options: Options) -> dict[str, Any]:
+    """Train a method, if it is not yet, and measure it on the evaluation scenes."""
+    for name, make in stages_of(options).items():
+        if STAGES.index(name) <= STAGES.index(METHODS[options.method]):
+            make(options)
+    policy = policy_of(options)
+    stage = open_stage(options, f"evaluate_{options.method}")
+    asked = {"options": plain(options.evaluate)}
+    if stage.result is not None and stage.result["of"] == asked:
+        return stage.result["results"]
+    if policy is None:
+        scenes = options.evaluate
+        solved = world_of(options).demonstrator(
+            scenes.episodes, seed=scenes.seed, stream=scenes.stream
+        )
+        results: dict[str, Any] = {options.method: by_scene(solved)}
+    else:
+        results = success_results(measured_success({options.method: policy}, options))
+    if curve := stage.run.metrics(f"baseline_{options.method}"):
+        wanted = [row for row in curve if "success" in row]
+        results["curve"] = [[row["trained_frames"], row["success"]] for row in wanted]
+    finish(options, stage, {"of": asked, "results": results})
+    return results
+
+
+def policy_of(options: Options) -> Any:
+    """Return the policy of a method, trained if it has to be; None where there is none."""
+    method = options.method
+    if method == "expert":
+        return None
+    if method == "random":
+        return uniform_policy(options)
+    if method == "bc":
+        imitate_truth(options)
+    run = adversarial(options) if method in ADVERSARIES else open_stage(options, "evaluate").run
+    known = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
+    return load_network(run, known.get(method, file_of(method)), "baselines", options)
+
+
+def file_of(method: str) -> str:
+    """Return the file of the policy of an adversarial method."""
+    return f"policy-{method}.safetensors"
+
+
+def uniform_policy(options: Options) -> Any:
+    """Return a policy that takes every action as often."""
+    policy = build(make_policy, options)
+    count = len(world_of(options).actions)
+
+    def undecided(pixels: torch.Tensor) -> torch.Tensor:
+        return torch.zeros(len(pixels), count, device=pixels.device)
+
+    policy.module[0] = TensorDictModule(undecided, [keys.PIXELS], [keys.LOGITS])
+    return policy
+
+
+def adversarial(options: Options) -> Run:
+    """Train a policy against a discriminator; see :mod:`ifo_grounding.baselines`."""
+    method, section = options.method, options.baseline
+    if method == "gail+bc":
+        imitate_truth(options)
+    stage = open_stage(options, f"baseline_{method}")
+    if stage.result is not None:
+        if stage.result["of"] != plain(section):
+            raise UserError(
+                f"{method} was trained in the run {options.run} with {stage.result['of']}: give "
+                "another run="
+            )
+        return stage.run
+    run, world = stage.run, world_of(options)
+    begun = load_network(run, REFERENCE, "baselines", options) if method == "gail+bc" else None
+    policy = build(make_policy, options) if begun is None else begun
+    value = build(make_value, options, init_from=policy)
+    seen = access(options, run)
+    adversary = ADVERSARIES[method](
+        seen,
+        options.preset,
+        steps=section.steps,
+        lr=section.lr,
+        swapped=section.swapped,
+        stop_action=world.stop_action,
+        seed=options.seed,
+        device=options.device,
+        **options.networks.changed(),
+    )
+    practice = options.self_examine
+    worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
+    config = replace(
+        practice,
+        iterations=math.ceil(section.frames / rounds),
+        entropy=section.entropy,
+        value_warmup=0 if begun is None else practice.value_warmup,
+        select_every=0,
+        evaluate_every=max(1, math.ceil(section.frames / rounds / 20)),
+    )
+    if method == "agile":
+        env = seen.starts(options.seed)
+    else:
+        env = TransformedEnv(simulator_of(options, worlds), chosen_starts(run, options))
+    history = improve_policy(
+        env.append_transform(adversary.reward),
+        policy,
+        value,
+        config,
+        seed=options.seed,
+        adversarial=adversary,
+        checkpoint=stage.checkpoint,
+        checkpoint_seconds=options.checkpoint_seconds,
+        log=stage.log(),
+        callback=validation_success(policy, rounds, options),
+        progress=options.progress,
+    )
+    save_network(run, file_of(method), policy)
+    finish(options, stage, {"of": plain(section), **history[-1]}, history)
+    return run
+
+
+def access(options: Options, run: Run) -> Any:
+    """Return what a method may use of the demonstrations."""
+    demos, world = load_demonstrations(run), world_of(options)
+    kind = ADVERSARIES[options.method].access
+    if kind is ActionDemonstrations:
+        if not (run / TRUTH).exists():
+            raise UserError(f"{options.method} needs true actions, and these were not recorded")
+        return ActionDemonstrations(demos, Truth.load(run / TRUTH))
+    if kind is SteppableDemonstrations:
+        if not hasattr(world, "steppable"):
+            raise UserError(
+                f"{options.method} steps from demonstrations' states: {type(world).__name__} has "
+                "no method steppable(num_envs, seed=, device=)"
+            )
+        worlds = options.self_examine.num_envs
+        env = world.steppable(worlds, seed=options.seed, device=options.device)
+        return SteppableDemonstrations(demos, env)
+    return demos
+
+
+def validation_success(policy: Any, frames: int, options: Options) -> Any:
+    """Return what measures the greedy policy on validation scenes, for the curve alone."""
+    env, shown = played(options, options.evaluate.audit_episodes, stream="validation", split="all")
+
+    def measure(step: int) -> dict[str, float]:
+        success = success_rate(policy, env, **shown).rate
+        return {"success": success.rate, "trained_frames": float(step * frames)}
+
+    return measure
+
+
+@recipe_main
+def main(options: Options) -> dict:
+    results = baseline(options)
+    if options.results:
+        variant = "-".join(filter(None, [options.variant, options.method]))
+        write_result(replace(options, variant=variant), results, "run baselines")
+    tell({options.method: results[options.method].get("rate", results[options.method])})
+    return results
+
+
+if __name__ == "__main__":
+    main()

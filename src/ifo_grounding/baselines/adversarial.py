@@ -1,0 +1,267 @@
+"""Adversarial imitation: a discriminator of demonstrations and policy, which pays the policy.
+
+GAIL (Ho and Ermon 2016) tells actions apart, GAIfO (Torabi et al. 2019) changes of state, AGILE
+(Bahdanau et al. 2019) states in which an instruction is fulfilled. Each is conditioned on the
+instruction, and pays through one transform, so that
+:func:`ifo_grounding.training.improve_policy` trains them all.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
+
+from ifo_grounding import keys
+from ifo_grounding.baselines.access import (
+    AFTER,
+    ActionDemonstrations,
+    SteppableDemonstrations,
+    transitions_of,
+)
+from ifo_grounding.data import Demonstrations
+from ifo_grounding.errors import UserError, share
+from ifo_grounding.modules import beside
+from ifo_grounding.networks import (
+    make_goal_classifier,
+    make_instruction_classifier,
+    make_reward_model,
+)
+from ifo_grounding.objectives.base import SupervisedLoss
+from ifo_grounding.training.loop import Metrics
+from ifo_grounding.training.updates import make_optimizer, means, update
+from ifo_grounding.transforms.base import rows_of
+from ifo_grounding.transforms.reward import RewardTransform
+
+
+class DiscriminatorLoss(SupervisedLoss):
+    """Binary cross entropy of demonstrations (1) against the policy (0).
+
+    Writes ``loss_discriminator``, ``demonstrated_probability``, ``policy_probability`` and, with
+    ``swapped``, ``swapped_probability``.
+
+    Args:
+        network: what it reads of a step, the instruction too, to one logit.
+        spare: share of the policy's steps, those that look most like demonstrations, that is left
+            out: they may be right (rho of AGILE).
+        swapped: whether demonstrations with another one's instruction are negatives, too (Zolna et
+            al. 2020): half of the weight of negatives.
+
+    >>> from tensordict.nn import TensorDictModule
+    >>> network = TensorDictModule(lambda pixels: pixels, ["pixels"], ["logit"])
+    >>> seen, own = (TensorDict({"pixels": torch.tensor([[x]])}, [1]) for x in (2.0, -2.0))
+    >>> loss = DiscriminatorLoss(network)(seen, own)["loss_discriminator"]
+    >>> round(float(loss), 4) == round(float(F.softplus(torch.tensor(-2.0))), 4)
+    True
+    """
+
+    def __init__(
+        self, network: TensorDictModule, *, spare: float = 0.0, swapped: bool = False
+    ) -> None:
+        super().__init__(network)
+        self.output = network.out_keys[0]
+        self.spare, self.swapped = share("spare", spare), swapped
+
+    def forward(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
+        """Compute the loss of a batch of demonstrated steps and one of the policy's."""
+        with self._mode():
+            right, wrong = self._logits(demonstrations), self._logits(policy)
+            kept = len(wrong) - int(self.spare * len(wrong))
+            wrong = wrong.sort().values[:kept]
+            negative = F.softplus(wrong).mean()
+            found = {
+                "demonstrated_probability": self._mean(right.sigmoid()),
+                "policy_probability": self._mean(wrong.sigmoid()),
+            }
+            if self.swapped:
+                other, differs = swap_instructions(demonstrations)
+                elsewhere = self._logits(other[differs])
+                if len(elsewhere):
+                    negative = (negative + F.softplus(elsewhere).mean()) / 2
+                    found["swapped_probability"] = self._mean(elsewhere.sigmoid())
+        loss = (F.softplus(-right).mean() + negative) / 2
+        return TensorDict({"loss_discriminator": loss, **found})
+
+    def _logits(self, batch: TensorDictBase) -> Tensor:
+        if not len(batch):
+            return torch.zeros(0)
+        read = batch.select(*self.network.in_keys)
+        return self.network(read).get(self.output).reshape(-1).float()
+
+
+def swap_instructions(batch: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+    """Return a batch [N] with the instruction of the row before, and where that is another one."""
+    own = batch[keys.INSTRUCTION]
+    other = own.roll(1, 0)
+    return batch.copy().set(keys.INSTRUCTION, other), (own != other).any(-1)
+
+
+class DiscriminatorReward(RewardTransform):
+    """Pays every step what a discriminator makes of it.
+
+    Args:
+        discriminator: its ``in_keys`` may name what a step led to, as ``("next", "pixels")``.
+        at_stop: the action by which a policy ends an episode: then 1 is paid at the stop where the
+            probability exceeds one half, and nothing before (AGILE). None pays every step its logit
+            (log D - log(1 - D), Fu et al. 2018), which neither rewards nor punishes long episodes
+            as such.
+    """
+
+    def __init__(self, discriminator: TensorDictModuleBase, at_stop: int | None = None) -> None:
+        self.later = [key == AFTER for key in discriminator.in_keys]
+        read = [keys.PIXELS if key == AFTER else key for key in discriminator.in_keys]
+        also = [] if at_stop is None else [keys.ACTION]
+        super().__init__(discriminator, str(discriminator.out_keys[0]), [*read, *also], None, also)
+        self.at_stop = at_stop
+
+    def pay(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
+        """Return the reward, float32 [*B, 1]."""
+        entries = [
+            rows_of(after if later else before, key)
+            for later, key in zip(self.later, self.in_keys, strict=False)
+        ]
+        if self.at_stop is None:
+            return self._score(entries).view(*before.batch_size, 1)
+        stops = rows_of(before, keys.ACTION) == self.at_stop
+        reward = torch.zeros(len(stops), device=stops.device)
+        rows = stops.nonzero().squeeze(-1)
+        reward[rows] = (self._score([entry[rows] for entry in entries]) > 0).float()
+        return reward.view(*before.batch_size, 1)
+
+
+def frames_of(seen: Any) -> Demonstrations:
+    """Return the demonstrations, whatever else a method may use."""
+    demos: Demonstrations = seen if isinstance(seen, Demonstrations) else seen.demos
+    return demos
+
+
+class Adversary:
+    """A discriminator, its reward, and the updates between two iterations of policy gradient.
+
+    Args:
+        seen: what the method may use; another kind is refused.
+        preset: of the network.
+        steps: gradient steps after each iteration.
+        spare: see :class:`DiscriminatorLoss`.
+        stop_action: the action by which a policy ends an episode.
+        options: for the network, such as ``seed`` and ``device``.
+
+    Raises:
+        UserError: where ``seen`` gives less than the method needs, or more than it may use.
+    """
+
+    access: type[Any]
+    """What the method may use."""
+    spare = 0.0
+    """Share of the policy's steps that is left out."""
+    network: TensorDictModule
+    reward: DiscriminatorReward
+
+    def __init__(
+        self,
+        seen: Any,
+        preset: str = "strong",
+        *,
+        steps: int = 10,
+        lr: float = 3e-4,
+        batch_size: int = 256,
+        swapped: bool = True,
+        stop_action: int | None = keys.STOP,
+        **options: Any,
+    ) -> None:
+        if type(seen) is not self.access:
+            raise UserError(
+                f"{type(self).__name__} uses {self.access.__name__}, no more and no less, got "
+                f"{type(seen).__name__}"
+            )
+        demos = frames_of(seen)
+        self.buffer = self.demonstrated(seen)
+        self.network = self.discriminator(demos, preset, **options)
+        self.loss = DiscriminatorLoss(self.network, spare=self.spare, swapped=swapped)
+        self.reward = self.paid(stop_action)
+        self.optimizer = make_optimizer(self.loss.parameters(), lr)
+        self.steps, self.batch_size = steps, batch_size
+
+    def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:
+        """Return the demonstrated steps that are told apart from the policy's."""
+        raise NotImplementedError
+
+    def discriminator(self, demos: Demonstrations, preset: str, **options: Any) -> TensorDictModule:
+        """Return the network."""
+        raise NotImplementedError
+
+    def paid(self, stop_action: int | None) -> DiscriminatorReward:
+        """Return the transform that pays."""
+        return DiscriminatorReward(self.network)
+
+    def __call__(self, batch: TensorDictBase) -> Metrics:
+        """Train on the policy's steps [N, T]; return mean metrics, named ``reward/...``."""
+        own, updates = batch.reshape(-1), []
+        self.network.train()
+        for _ in range(self.steps):
+            rows = torch.randint(len(own), (self.batch_size,))
+            shown = beside(self.buffer.sample(self.batch_size), self.loss)
+            updates.append(update(self.loss(shown, own[rows]), self.optimizer, grad_clip=1.0))
+        self.network.eval()
+        return {f"reward/{name}": value for name, value in means(updates).items()}
+
+
+class GAIL(Adversary):
+    """Tells demonstrated actions from the policy's: state, instruction, action."""
+
+    access: type[Any] = ActionDemonstrations
+
+    def demonstrated(self, seen: ActionDemonstrations) -> TensorDictReplayBuffer:  # noqa: D102
+        return seen.transitions()
+
+    def discriminator(self, demos: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
+        return make_reward_model(demos, preset, **options)
+
+
+class GAIfO(Adversary):
+    """Tells demonstrated changes from the policy's: state, next state, instruction."""
+
+    access: type[Any] = Demonstrations
+
+    def demonstrated(self, seen: Demonstrations) -> TensorDictReplayBuffer:  # noqa: D102
+        return transitions_of(seen)
+
+    def discriminator(self, demos: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
+        in_keys = (keys.PIXELS, AFTER, keys.INSTRUCTION)
+        return make_goal_classifier(demos, preset, in_keys=in_keys, **options)
+
+
+class AGILE(Adversary):
+    """Tells last frames of demonstrations from the policy's states: state, instruction.
+
+    The quarter of the policy's states that it likes best is left out. Paid is the stop where the
+    discriminator finds the instruction fulfilled: our worlds end there, those of the paper do not.
+    """
+
+    access: type[Any] = SteppableDemonstrations
+    spare = 0.25
+
+    def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:  # noqa: D102
+        return transitions_of(frames_of(seen), last=True)
+
+    def discriminator(self, demos: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
+        in_keys = (AFTER, keys.INSTRUCTION)
+        return make_instruction_classifier(demos, preset, in_keys=in_keys, **options)
+
+    def paid(self, stop_action: int | None) -> DiscriminatorReward:  # noqa: D102
+        if stop_action is None:
+            raise UserError(
+                "AGILE is paid at the stop, and this world has none: give world.stop=add"
+            )
+        return DiscriminatorReward(self.network, at_stop=stop_action)
+
+
+class ChosenAGILE(AGILE):
+    """AGILE without its access: chosen instructions in fresh states, as in self-examination."""
+
+    access: type[Any] = Demonstrations

@@ -1,0 +1,182 @@
+"""Rivals of Table 1: what each may use, what its discriminator learns and pays."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+from ifo_grounding import baselines
+from ifo_grounding.baselines import (
+    AGILE,
+    GAIL,
+    ActionDemonstrations,
+    ChosenAGILE,
+    DiscriminatorLoss,
+    DiscriminatorReward,
+    GAIfO,
+    SteppableDemonstrations,
+)
+from ifo_grounding.data import record_demonstrations
+from ifo_grounding.errors import UserError
+from ifo_grounding.keys import STOP
+from ifo_grounding.worlds import Grid
+
+SMALL = {"features": 8, "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def sources():
+    demos, truth = record_demonstrations("move", 12, seed=3, keep_truth=True)
+    steppable = SteppableDemonstrations(demos, Grid("move").steppable(5, seed=3))
+    return {
+        "frames": demos,
+        "actions": ActionDemonstrations(demos, truth),
+        "steps": steppable,
+    }
+
+
+@pytest.mark.parametrize(
+    ("method", "allowed"),
+    [(GAIL, "actions"), (GAIfO, "frames"), (AGILE, "steps"), (ChosenAGILE, "frames")],
+)
+def test_a_method_uses_its_row_of_table_1_no_more_and_no_less(method, allowed, sources):
+    assert method(sources[allowed], **SMALL).network is not None
+    for name, source in sources.items():
+        if name != allowed:
+            with pytest.raises(UserError, match="no more and no less"):
+                method(source, **SMALL)
+
+
+def test_only_those_that_may_see_actions_hold_any(sources):
+    held = {
+        method: set(method(sources[name], **SMALL).buffer[:].keys(True, True))
+        for method, name in ((GAIL, "actions"), (GAIfO, "frames"), (AGILE, "steps"))
+    }
+    assert "action" in held[GAIL]
+    assert "action" not in held[GAIfO] | held[AGILE]
+    truth = sources["actions"].truth.actions
+    assert torch.equal(GAIL(sources["actions"], **SMALL).buffer[:]["action"], truth.long())
+
+
+def test_agile_reads_last_frames_alone(sources):
+    shown = AGILE(sources["steps"], **SMALL).buffer[:]
+    demos = sources["frames"]
+    last = demos.frames(demos.starts + demos.lengths - 1)
+    assert torch.equal(shown["next", "pixels"], last)
+    assert torch.equal(shown["instruction"], demos.instructions.long())
+
+
+def test_episodes_begin_where_demonstrations_do(sources):
+    env = sources["steps"].starts(seed=1)
+    firsts = sources["frames"].frames(sources["frames"].starts)
+    rollout = env.rollout(60, break_when_any_done=False)
+    begun = torch.cat(
+        [torch.ones(5, 1, dtype=torch.bool), rollout["next", "done"].squeeze(-1)[:, :-1]], 1
+    )
+    shown = rollout["pixels"][begun]
+    same = (shown.unsqueeze(1) == firsts).flatten(2).all(-1)
+    assert len(shown) > 5 and same.any(1).all()
+    said = sources["frames"].instructions.long()[same.int().argmax(1)]
+    assert torch.equal(rollout["instruction"][begun], said)
+
+
+def test_another_simulator_is_refused(sources):
+    with pytest.raises(UserError, match="does not begin as demonstrations"):
+        SteppableDemonstrations(sources["frames"], Grid("move").steppable(5, seed=4))
+    for index in ([0, 1], [0, 1, 2, 3, 12], [-1, 0, 1, 2, 3]):
+        with pytest.raises(UserError, match="number of one of 12 demonstrations"):
+            sources["steps"].reset(index)
+
+
+def steps(*logits, said=None):
+    said = said or [[1]] * len(logits)
+    return TensorDict(
+        {"x": torch.tensor(logits).unsqueeze(-1), "instruction": torch.tensor(said)}, [len(logits)]
+    )
+
+
+def scorer():
+    """Score x, and 10 less where the instruction is 2."""
+    return TensorDictModule(lambda x, said: x - 10.0 * (said == 2), ["x", "instruction"], ["logit"])
+
+
+def softplus(x):
+    return math.log1p(math.exp(x))
+
+
+def test_the_loss_by_hand():
+    found = DiscriminatorLoss(scorer())(steps(1.0, 3.0), steps(-1.0, 0.0, 2.0, 4.0))
+    right = (softplus(-1) + softplus(-3)) / 2
+    wrong = sum(map(softplus, (-1, 0, 2, 4))) / 4
+    assert found["loss_discriminator"].item() == pytest.approx((right + wrong) / 2, rel=1e-5)
+    assert found["demonstrated_probability"].item() == pytest.approx(
+        (1 / (1 + math.exp(-1)) + 1 / (1 + math.exp(-3))) / 2, rel=1e-5
+    )
+
+
+def test_the_likeliest_of_the_policys_are_spared():
+    found = DiscriminatorLoss(scorer(), spare=0.5)(steps(1.0), steps(4.0, -1.0, 2.0, 0.0))
+    wrong = (softplus(-1) + softplus(0)) / 2
+    expected = (softplus(-1) + wrong) / 2
+    assert found["loss_discriminator"].item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_demonstrations_with_another_instruction_are_negatives():
+    loss = DiscriminatorLoss(scorer(), swapped=True)
+    found = loss(steps(1.0, 3.0, 3.0, said=[[1], [2], [2]]), steps(0.0))
+    # Row 0 is given 2, row 1 is given 1; row 2 would be given its own.
+    right = (softplus(-1) + softplus(7) + softplus(7)) / 3
+    elsewhere = (softplus(1 - 10) + softplus(3)) / 2
+    wrong = (softplus(0) + elsewhere) / 2
+    assert found["loss_discriminator"].item() == pytest.approx((right + wrong) / 2, rel=1e-5)
+    alike = loss(steps(1.0, 3.0), steps(0.0))  # nothing to swap with
+    assert "swapped_probability" not in set(alike.keys())
+
+
+def test_every_step_is_paid_its_logit_or_the_stop_its_verdict():
+    def brightness(pixels, _):
+        return pixels.float().mean((-3, -2, -1)).unsqueeze(-1) - 1.0
+
+    keys_read = [("next", "pixels"), "instruction"]
+    model = TensorDictModule(brightness, keys_read, ["logit"])
+    before = TensorDict(
+        {"instruction": torch.ones(3, 2).long(), "action": torch.tensor([STOP, STOP, 0])}, [3]
+    )
+    bright = torch.tensor([3, 0, 3], dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 8, 8)
+    after = TensorDict({"pixels": bright}, [3])
+    assert DiscriminatorReward(model).pay(before, after).tolist() == [[2.0], [-1.0], [2.0]]
+    at_stop = DiscriminatorReward(model, at_stop=STOP)
+    assert at_stop.pay(before, after).tolist() == [[1.0], [0.0], [0.0]]
+
+
+def test_the_reward_of_a_step_is_that_of_what_it_led_to(sources):
+    adversary = GAIfO(sources["frames"], **SMALL)
+    env = sources["steps"].starts(seed=2).append_transform(adversary.reward)
+    rollout = env.rollout(6, break_when_any_done=False)
+    logits = adversary.network(rollout.reshape(-1))["goal_score"]
+    paid = rollout["next", "learned_reward"].reshape(-1, 1)
+    torch.testing.assert_close(paid, logits, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["actions", "frames", "steps"])
+def test_updates_tell_demonstrations_from_the_policy(name, sources):
+    method = {"actions": GAIL, "frames": GAIfO, "steps": AGILE}[name]
+    torch.manual_seed(0)
+    adversary = method(sources[name], steps=40, lr=5e-3, batch_size=32, features=16, seed=0)
+    batch = sources["steps"].starts(seed=2).rollout(12, break_when_any_done=False)
+    metrics = adversary(batch)
+    assert not adversary.network.training
+    later = adversary(batch)
+    gap = later["reward/demonstrated_probability"] - later["reward/policy_probability"]
+    assert gap > 0.5 and later["reward/loss_discriminator"] < metrics["reward/loss_discriminator"]
+
+
+def test_agile_needs_a_stop(sources):
+    with pytest.raises(UserError, match="paid at the stop"):
+        AGILE(sources["steps"], stop_action=None, **SMALL)
+
+
+def test_all_that_is_public_is_there():
+    assert all(hasattr(baselines, name) for name in baselines.__all__)

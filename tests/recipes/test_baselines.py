@@ -1,0 +1,54 @@
+"""The recipe of the rivals: each method trains a little, is measured, and is done then."""
+
+import shutil
+
+import pytest
+
+from ifo_grounding.baselines.config import METHODS
+from ifo_grounding.config import STAGES
+from ifo_grounding.errors import UserError
+from ifo_grounding.files import read_json
+from ifo_grounding.options import options_of
+from importing import recipes_importable
+from recipes.conftest import TINY, make_stages
+
+FEWER = ("baseline.frames=160", "baseline.steps=1", "demonstrations.n=20")
+
+
+@pytest.fixture(scope="module")
+def practised(tmp_path_factory):
+    """The folder of a run that has both phases."""
+    folder = tmp_path_factory.mktemp("practised") / "run"
+    with recipes_importable():
+        make_stages(options_of(*TINY, *FEWER, f"run={folder}"), until=STAGES[-1])
+    return folder
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
+    from baselines import baseline
+
+    run = shutil.copytree(practised, tmp_path / "run")
+    given = options(*FEWER, f"method={method}")
+    results = baseline(given)
+    assert 0 <= results[method]["rate"]["rate"] <= 1 and results[method]["rate"]["count"] == 20
+    trained = run / "stages" / f"baseline_{method}.json"
+    if trained.exists():
+        frames = [row["frames"] for row in read_json(run / f"metrics/baseline_{method}.json")]
+        assert sum(frames) >= 160 and results["curve"][-1][0] == sum(frames)
+        with pytest.raises(UserError, match="give another run="):
+            baseline(options(*FEWER, f"method={method}", "baseline.frames=240"))
+    stamp = trained.stat().st_mtime_ns if trained.exists() else None
+    assert baseline(given) == results
+    assert stamp is None or trained.stat().st_mtime_ns == stamp
+
+
+def test_a_rival_that_needs_what_a_world_lacks_says_so(practised, options, tmp_path):
+    from baselines import baseline
+
+    run = shutil.copytree(practised, tmp_path / "run")
+    shutil.rmtree(run / "truth")
+    with pytest.raises(UserError, match="needs true actions"):
+        baseline(options(*FEWER, "method=gail"))
+    with pytest.raises(UserError, match="method"):
+        options("method=dagger")
