@@ -170,14 +170,17 @@ def learn(
 
 
 def keep(
-    options: Options, stage: Stage, best: Trial, file: str, calibrate: bool = False
+    options: Options, stage: Stage, best: Trial, file: str, calibrate: bool = False, **found: Any
 ) -> dict[str, Any]:
-    """Train the best of several trials to the end, save its network, and finish the stage."""
+    """Train the best of several trials to the end, save its network, and finish the stage.
+
+    What else was found goes into the stage's record.
+    """
     history = best.finish(stage.log())
     if calibrate:
         best.loss.calibrate()
     save_network(stage.run, file, best.loss.network)
-    return finish(options, stage, {**history[-1], "trial": best.number}, history)
+    return finish(options, stage, {**history[-1], "trial": best.number, **found}, history)
 
 
 def fit_options(options: Options, stage: Stage) -> dict[str, Any]:

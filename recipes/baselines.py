@@ -9,12 +9,15 @@ from typing import Any
 
 import torch
 from _shared import (
+    INVERSE,
     POLICIES,
     REFERENCE,
+    TRANSITIONS,
     TRUTH,
     build,
     finish,
     load_demonstrations,
+    load_labels,
     load_network,
     open_stage,
     plain,
@@ -25,6 +28,7 @@ from _shared import (
     write_result,
 )
 from evaluate import measured_success, played, success_results
+from imitate import imitate_transitions, split_transitions
 from references import imitate_truth
 from self_examine import chosen_starts
 from tensordict.nn import TensorDictModule
@@ -35,22 +39,29 @@ from ifo_grounding import keys
 from ifo_grounding.baselines import (
     AGILE,
     GAIL,
+    LCRL,
     ActionDemonstrations,
     Adversary,
     ChosenAGILE,
     GAIfO,
+    HalfOfEach,
+    SteppableActionDemonstrations,
     SteppableDemonstrations,
+    steps_of_policy,
 )
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import STAGES, Options
-from ifo_grounding.data import Truth
+from ifo_grounding.data import Collected, Truth, label_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import success_rate
 from ifo_grounding.networks import make_policy, make_value
+from ifo_grounding.objectives import InverseLoss
 from ifo_grounding.report.results import by_scene
-from ifo_grounding.training import Run, improve_policy
+from ifo_grounding.training import Run, Stage, fit, improve_policy
 
+ROWS = 32
+"""Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {
     "gail": GAIL,
     "gail+bc": GAIL,
@@ -65,19 +76,12 @@ def baseline(options: Options) -> dict[str, Any]:
     for name, make in stages_of(options).items():
         if STAGES.index(name) <= STAGES.index(METHODS[options.method]):
             make(options)
-    policy = policy_of(options)
+    learned = trained(options)
     stage = open_stage(options, f"evaluate_{options.method}")
     asked = {"options": plain(options.evaluate)}
     if stage.result is not None and stage.result["of"] == asked:
         return stage.result["results"]
-    if policy is None:
-        scenes = options.evaluate
-        solved = world_of(options).demonstrator(
-            scenes.episodes, seed=scenes.seed, stream=scenes.stream
-        )
-        results: dict[str, Any] = {options.method: by_scene(solved)}
-    else:
-        results = success_results(measured_success({options.method: policy}, options))
+    results = measured(learned, options)
     if curve := stage.run.metrics(f"baseline_{options.method}"):
         wanted = [row for row in curve if "success" in row]
         results["curve"] = [[row["trained_frames"], row["success"]] for row in wanted]
@@ -85,16 +89,36 @@ def baseline(options: Options) -> dict[str, Any]:
     return results
 
 
-def policy_of(options: Options) -> Any:
-    """Return the policy of a method, trained if it has to be; None where there is none."""
+def measured(learned: Any, options: Options) -> dict[str, Any]:
+    """Measure what a method has learned on the evaluation scenes."""
+    scenes = options.evaluate
+    if isinstance(learned, LCRL):
+        env, _ = played(options, scenes.episodes)
+        env.set_seed(scenes.seed)
+        return {options.method: by_scene(learned.success(env, scenes.episodes))}
+    if options.method == "expert":
+        of = {"seed": scenes.seed, "stream": scenes.stream}
+        return {options.method: by_scene(world_of(options).demonstrator(scenes.episodes, **of))}
+    return success_results(measured_success({options.method: learned}, options))
+
+
+def trained(options: Options) -> Any:
+    """Return what a method has learned, a policy mostly; it learns now if it has to."""
     method = options.method
     if method == "expert":
         return None
     if method == "random":
         return uniform_policy(options)
+    if method == "lc-rl":
+        return planned(options)
     if method == "bc":
         imitate_truth(options)
-    run = adversarial(options) if method in ADVERSARIES else open_stage(options, "evaluate").run
+    if method in ADVERSARIES:
+        run = adversarial(options)
+    elif method == "bco-alpha":
+        run = bco_alpha(options)
+    else:
+        run = open_stage(options, "evaluate").run
     known = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
     return load_network(run, known.get(method, file_of(method)), "baselines", options)
 
@@ -116,18 +140,74 @@ def uniform_policy(options: Options) -> Any:
     return policy
 
 
+def bco_alpha(options: Options) -> Run:
+    """Imitate anew, with labels of an inverse model that has learned from the policy's steps."""
+    stage = trained_by(options)
+    if stage.result is not None:
+        return stage.run
+    run, world, section = stage.run, world_of(options), options.transitions
+    demos = load_demonstrations(run)
+    own = steps_of_policy(
+        simulator_of(options, section.num_envs),
+        load_network(run, POLICIES["phase1"], "imitate", options),
+        demos.pool(),
+        math.ceil(options.baseline.alpha * section.n),
+        stop_action=world.stop_action,
+        drop_unchanged=section.drop_unchanged,
+        seed=options.seed,
+        progress=options.progress,
+    )
+    random = Collected.load(run.need(TRANSITIONS, "collect_transitions"))
+    inverse = load_network(run, INVERSE, "train_inverse", options)
+    both: Any = HalfOfEach(random.buffer, own.buffer)
+    fit(InverseLoss(inverse), both, options.inverse, seed=options.seed, name=stage.name)
+    _, report = label_demonstrations(demos, inverse, progress=options.progress)
+    changed = float((report.actions != load_labels(run)).float().mean())
+    seen, held_out = split_transitions(demos, report.actions, options.imitate.held_out)
+    found = {"of": plain(options.baseline), "labels_changed": changed}
+    imitate_transitions(options, stage, seen, held_out, file_of("bco-alpha"), **found)
+    return run
+
+
+def planned(options: Options) -> LCRL:
+    """Return LC-RL with the reward that it learned, learned now if it has to be."""
+    stage, world = trained_by(options), world_of(options)
+    if options.task not in ("move", "move-udlr") or not hasattr(world, "steppable"):
+        raise UserError("lc-rl plans the arm's cells: task=move or task=move-udlr")
+    run, demos = stage.run, load_demonstrations(stage.run)
+    env = world.steppable(ROWS, seed=options.seed)
+    truth = Truth.load(run.need(TRUTH, "record_demonstrations"))
+    seen = SteppableActionDemonstrations(SteppableDemonstrations(demos, env), truth)
+    how = {"seed": options.seed, **options.networks.changed()}
+    planner = LCRL(seen, world.size, options.preset, **how)
+    file = file_of("lc-rl")
+    if stage.result is None:
+        found = planner.learn(options.baseline.likelihood_steps, ROWS, options.seed)
+        save_network(run, file, planner.network)
+        finish(options, stage, {"of": plain(options.baseline), **found})
+    trained = load_network(run, file, "baselines", options)
+    planner.network.load_state_dict(trained.state_dict())
+    return planner
+
+
+def trained_by(options: Options) -> Stage:
+    """Return the stage that trains a method; one that was trained otherwise is refused."""
+    stage, section = open_stage(options, f"baseline_{options.method}"), plain(options.baseline)
+    if stage.result is not None and stage.result["of"] != section:
+        raise UserError(
+            f"{options.method} was trained in the run {options.run} with {stage.result['of']}: "
+            "give another run="
+        )
+    return stage
+
+
 def adversarial(options: Options) -> Run:
     """Train a policy against a discriminator; see :mod:`ifo_grounding.baselines`."""
     method, section = options.method, options.baseline
     if method == "gail+bc":
         imitate_truth(options)
-    stage = open_stage(options, f"baseline_{method}")
+    stage = trained_by(options)
     if stage.result is not None:
-        if stage.result["of"] != plain(section):
-            raise UserError(
-                f"{method} was trained in the run {options.run} with {stage.result['of']}: give "
-                "another run="
-            )
         return stage.run
     run, world = stage.run, world_of(options)
     begun = load_network(run, REFERENCE, "baselines", options) if method == "gail+bc" else None

@@ -1,5 +1,7 @@
 """Imitate the labelled demonstrations: phase 1, which is BCO (paper, 1st-phase)."""
 
+from typing import Any
+
 from _shared import (
     POLICIES,
     build,
@@ -32,9 +34,17 @@ def imitate(options: Options) -> dict:
 
 
 def imitate_transitions(
-    options: Options, stage: Stage, seen: ReplayBuffer, held_out: ReplayBuffer | None, file: str
+    options: Options,
+    stage: Stage,
+    seen: ReplayBuffer,
+    held_out: ReplayBuffer | None,
+    file: str,
+    **found: Any,
 ) -> dict:
-    """Imitate transitions with their actions, from the best of a few initial weights."""
+    """Imitate transitions with their actions, from the best of a few initial weights.
+
+    What else was found goes into the stage's record.
+    """
     section = options.imitate
     decode_on(options.device, seen)
 
@@ -60,7 +70,7 @@ def imitate_transitions(
 
     trials = [trial(number) for number in range(section.trials)]
     best = successive_halving(trials, section.trial_steps, section.trial_halvings)
-    return keep(options, stage, best, file)
+    return keep(options, stage, best, file, **found)
 
 
 def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, ReplayBuffer | None]:

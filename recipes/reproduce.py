@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from tqdm import tqdm
 
+from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home
@@ -24,6 +25,7 @@ from ifo_grounding.training import Run
 from ifo_grounding.training.checkpoint import leaves
 
 WANTED = {
+    ("table", 1): (),  # a piece for each method
     ("table", 2): ("phase-1", "pairs-5000", "pairs-10000"),
     ("table", 3): ("phase-1",),
     ("table", 4): ("zero-shot", "zero-shot-pairs-5000"),
@@ -40,7 +42,7 @@ class ReproduceOptions:
     """What is made, and how many pieces side by side."""
 
     table: int | None = None
-    """Of the paper: 2, 3 or 4."""
+    """Of the paper: 1, with a success for each method, 2, 3 or 4."""
     figure: int | None = None
     """Of the paper: 5 or 6."""
     levels: list[str] = field(default_factory=list)
@@ -52,7 +54,8 @@ class ReproduceOptions:
     seeds: list[int] = field(default_factory=lambda: [0])
     """With which seeds."""
     demonstrations: list[int] = field(default_factory=list)
-    """Of each piece: by default 80,000, of BabyAI 1,000 and 5,000."""
+    """Of each piece: by default 80,000, of Table 1 200, 2,000 and 20,000, of BabyAI 1,000 and
+    5,000."""
     jobs: int = 2
     """Chains of pieces side by side, each on one thread."""
     device: str = "cpu"
@@ -71,6 +74,8 @@ class ReproduceOptions:
     """Further ones by preset and task."""
     phase: dict[str, Any] = field(default_factory=dict)
     """Further ones by piece."""
+    method: dict[str, Any] = field(default_factory=dict)
+    """Options of the methods of Table 1."""
     level: dict[str, Any] = field(default_factory=dict)
     """Options of levels of BabyAI."""
 
@@ -91,13 +96,15 @@ ConfigStore.instance().store(name="reproduce_options", node=ReproduceOptions)
 
 @dataclass(frozen=True)
 class Piece:
-    """One call of the recipe `two_phase` that leaves one small file of results."""
+    """One call of a recipe that leaves one small file of results."""
 
     run: str
     arguments: tuple[str, ...]
     file: Path
     base: str | None = None
     """The run that it begins with."""
+    recipe: str = "two_phase"
+    """The recipe that makes it."""
 
     @property
     def log(self) -> Path:
@@ -107,7 +114,11 @@ class Piece:
     def make(self) -> int:
         """Make it in a process of its own, on one thread."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, str(Path(__file__).with_name("two_phase.py")), *self.arguments]
+        command = [
+            sys.executable,
+            str(Path(__file__).with_name(f"{self.recipe}.py")),
+            *self.arguments,
+        ]
         with self.log.open("w") as log:
             return subprocess.run(
                 command,
@@ -122,7 +133,7 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
     """Return the pieces of what is asked for: chains, each from one phase 1."""
     asked = [(k, getattr(options, k)) for k in ("table", "figure") if getattr(options, k)]
     if not asked and not options.levels:
-        raise UserError("name a table=2, 3 or 4, a figure=5 or 6, or levels=[GoToObj]")
+        raise UserError("name a table=1, 2, 3 or 4, a figure=5 or 6, or levels=[GoToObj]")
     needed = {phase for key in asked for phase in WANTED[key]}
     phases = [phase for phase in options.phase if phase in needed]
     chains = [
@@ -132,6 +143,14 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
         )
         if phases
     ]
+    if options.table == 1:
+        numbers = options.demonstrations or [200, 2000, 20_000]
+        chains += [
+            [of_method(options, task, preset, n, seed, method) for method in METHODS]
+            for seed, n, preset, task in product(
+                options.seeds, numbers, options.presets, options.tasks
+            )
+        ]
     levels = product(options.seeds, options.demonstrations or [1000, 5000], options.levels)
     return chains + [[of_level(options, level, n, seed)] for seed, n, level in levels]
 
@@ -153,6 +172,21 @@ def piece(
     file = f"tables/{task}-{n}-{preset}-{phase}-seed{seed}.json"
     base = name.format(first) if first else None
     return call(options, name.format(phase), chosen, file, base)
+
+
+def of_method(
+    options: ReproduceOptions, task: str, preset: str, n: int, seed: int, method: str
+) -> Piece:
+    """Return the piece of one method of Table 1; all of a chain go on with one run."""
+    name = f"{task}-{n}-{preset}"
+    chosen: list[Mapping[str, Any]] = [
+        {"task": task, "preset": preset, "seed": seed, "demonstrations": {"n": n}},
+        {"method": method},
+        options.method,
+    ]
+    file = f"baselines/{name}-{method}-seed{seed}.json"
+    made = call(options, f"baselines-{name}-seed{seed}", chosen, file, None)
+    return replace(made, recipe="baselines")
 
 
 def of_level(options: ReproduceOptions, level: str, n: int, seed: int) -> Piece:

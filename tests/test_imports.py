@@ -155,6 +155,19 @@ def test_learner_reads_only_the_vocabulary_of_the_tasks(layer):
     assert not wrong
 
 
+def test_no_learner_knows_the_rivals():
+    """They may read actions and step from demonstrations' states, even inside of functions."""
+    allowed = {"config.py"}  # of whose options some are theirs
+    wrong = [
+        f"{path.relative_to(PACKAGE)}: {name}"
+        for path in PACKAGE.rglob("*.py")
+        if path.parent.name != "baselines" and path.name not in allowed
+        for name in imports_of(path)
+        if is_under(name, "ifo_grounding.baselines")
+    ]
+    assert not wrong
+
+
 def test_the_vocabulary_knows_nothing_of_the_truth():
     names = imports_of(PACKAGE / "tasks" / "vocabulary.py")
     ours = {name for name in names if is_under(name, "ifo_grounding")}

@@ -272,8 +272,8 @@ class Options:
     references: bool = False
     """Whether ``demo`` also imitates the demonstrator's true actions, to compare with."""
     method: str = "ours"
-    """Of ``run baselines``: ``bc``, ``bco``, ``gail``, ``gail+bc``, ``gaifo``, ``agile``,
-    ``agile-chosen``, ``ours``, ``random`` or ``expert``."""
+    """Of ``run baselines``: ``bc``, ``bco``, ``bco-alpha``, ``gail``, ``gail+bc``, ``gaifo``,
+    ``agile``, ``agile-chosen``, ``lc-rl``, ``ours``, ``random`` or ``expert``."""
     to: str = "shared"
     """Folder to which ``share`` writes the networks."""
     hub: str | None = None

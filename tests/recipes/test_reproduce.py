@@ -100,3 +100,22 @@ def test_a_piece_that_fails_is_named_and_leaves_the_rest_of_its_chain(reproduce_
     failed = reproduce(reproduce_options("figure=6", *TINY, "+all.imitate.lr=-1.0"))
     assert len(failed) == 1
     assert "imitate: lr must be above 0" in failed[0].log.read_text()
+
+
+def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_path):
+    from reproduce import pieces
+
+    from ifo_grounding.baselines.config import METHODS
+
+    asked = reproduce_options("table=1", "tasks=[move,pick]", "presets=[strong]", "seeds=[3]")
+    chains = pieces(asked)
+    assert len(chains) == 2 * 3  # tasks, numbers of demonstrations
+    assert {piece.recipe for chain in chains for piece in chain} == {"baselines"}
+    for chain in chains:
+        given = [options_of(*piece.arguments) for piece in chain]
+        assert [each.method for each in given] == list(METHODS)
+        assert len({each.run for each in given}) == 1 and given[0].seed == 3
+        few = given[0].demonstrations.n < 1000
+        assert given[0].budget == ("few" if few else "many")
+        assert given[0].evaluate.episodes == 5000
+    assert chains[0][0].file == tmp_path / "results/baselines/move-200-strong-bc-seed3.json"

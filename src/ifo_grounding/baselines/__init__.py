@@ -4,7 +4,11 @@ Nothing of the method itself imports this package: a learner of observation-only
 neither reads their actions nor steps from their states.
 """
 
-from ifo_grounding.baselines.access import ActionDemonstrations, SteppableDemonstrations
+from ifo_grounding.baselines.access import (
+    ActionDemonstrations,
+    SteppableActionDemonstrations,
+    SteppableDemonstrations,
+)
 from ifo_grounding.baselines.adversarial import (
     AGILE,
     GAIL,
@@ -14,15 +18,21 @@ from ifo_grounding.baselines.adversarial import (
     DiscriminatorReward,
     GAIfO,
 )
+from ifo_grounding.baselines.bco import HalfOfEach, steps_of_policy
+from ifo_grounding.baselines.lc_rl import LCRL
 
 __all__ = [
     "AGILE",
     "GAIL",
+    "LCRL",
     "ActionDemonstrations",
     "Adversary",
     "ChosenAGILE",
     "DiscriminatorLoss",
     "DiscriminatorReward",
     "GAIfO",
+    "HalfOfEach",
+    "SteppableActionDemonstrations",
     "SteppableDemonstrations",
+    "steps_of_policy",
 ]

@@ -104,6 +104,19 @@ class SteppableDemonstrations:
         return TransformedEnv(self.env, DemonstrationStarts(len(self.demos), seed))
 
 
+@dataclass(frozen=True)
+class SteppableActionDemonstrations:
+    """True actions, and a simulator that begins where a demonstration began: for LC-RL."""
+
+    steps: SteppableDemonstrations
+    truth: Truth
+
+    @property
+    def demos(self) -> Demonstrations:
+        """What was shown."""
+        return self.steps.demos
+
+
 class DemonstrationStarts(Transform):
     """Begins each episode with a scene drawn at random among the first ``count``."""
 

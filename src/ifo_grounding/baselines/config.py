@@ -9,11 +9,13 @@ from ifo_grounding.errors import check_numbers, check_range
 METHODS = {
     "bc": "record_demonstrations",
     "bco": "imitate",
+    "bco-alpha": "imitate",
     "gail": "train_instruction",
     "gail+bc": "train_instruction",
     "gaifo": "train_instruction",
     "agile": "record_demonstrations",
     "agile-chosen": "train_instruction",
+    "lc-rl": "record_demonstrations",
     "ours": "self_examine",
     "random": "record_demonstrations",
     "expert": "record_demonstrations",
@@ -23,7 +25,7 @@ METHODS = {
 
 @dataclass
 class BaselineConfig:
-    """Adversarial methods of ``ifo-grounding run baselines``."""
+    """Rivals of Table 1: ``ifo-grounding run baselines``."""
 
     frames: int = 2_000_000
     """Steps of the simulator that the policy learns from."""
@@ -35,9 +37,14 @@ class BaselineConfig:
     """Whether demonstrations with another instruction are negatives, too."""
     entropy: float = 0.01
     """Weight of the policy's entropy bonus."""
+    alpha: float = 1.0
+    """Of ``bco-alpha``: steps of the policy, by the number of random steps, from which the inverse
+    model learns on."""
+    likelihood_steps: int = 300
+    """Of ``lc-rl``: gradient steps of the reward."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
-        check_range(self, "frames", "steps", least=1)
-        check_range(self, "lr", above=0)
+        check_range(self, "frames", "steps", "likelihood_steps", least=1)
+        check_range(self, "lr", "alpha", above=0)
         check_range(self, "entropy", least=0)

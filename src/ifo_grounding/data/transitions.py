@@ -147,6 +147,7 @@ def collect_transitions(
     stop_probability: float | None = None,
     stop_action: int | None = None,
     drop_unchanged: bool = True,
+    policy: TensorDictModuleBase | None = None,
     seed: int = 0,
     progress: bool = False,
     **options: Any,
@@ -165,6 +166,7 @@ def collect_transitions(
         stop_probability: probability of the stop; by default all actions are equally likely.
         stop_action: by default that of the environment; none where that is None.
         drop_unchanged: whether to leave out unchanged transitions other than stops.
+        policy: acts in place of chance, where it is given what it reads.
         seed: of the actions; scenes are drawn by the environment.
         options: for ``TensorDictReplayBuffer``, such as ``batch_size``, ``sampler``, ``generator``;
             a ``transform`` comes after frames are decoded.
@@ -185,20 +187,20 @@ def collect_transitions(
             "kept: give stop_action=, set its stop_action (None where no action is), or say "
             "drop_unchanged=False"
         )
-    policy = RandomActions(env, stop_probability, stop_action, seed)
-    taken = torch.zeros(policy.n_actions, dtype=torch.int64)
+    chance = RandomActions(env, stop_probability, stop_action, seed)
+    taken = torch.zeros(chance.n_actions, dtype=torch.int64)
     actions: list[Tensor] = []
 
     def pieces() -> Iterator[Tensor]:
         """Yield frames and next frames in turns, uint8 [2 K, C, H, W], of the K kept steps."""
-        for batch in _collect(env, policy, n, progress):
+        for batch in _collect(env, policy or chance, n, progress):
             action = batch[keys.ACTION].cpu()
             pair = torch.stack([batch[keys.PIXELS], batch[keys.NEXT, keys.PIXELS]], 1).cpu()
             taken.add_(action.bincount(minlength=len(taken)))
             if drop_unchanged:
                 keep = (pair[:, 0] != pair[:, 1]).flatten(1).any(1)
-                if policy.stop_action is not None:
-                    keep |= action == policy.stop_action
+                if chance.stop_action is not None:
+                    keep |= action == chance.stop_action
                 action, pair = action[keep], pair[keep]
             actions.append(action)
             yield pair.flatten(0, 1)
@@ -223,7 +225,7 @@ def _compare_workers(env: EnvBase, first: Tensor) -> None:
 
 
 def _collect(
-    env: EnvBase, policy: RandomActions, n: int, progress: bool
+    env: EnvBase, policy: TensorDictModuleBase, n: int, progress: bool
 ) -> Iterator[TensorDictBase]:
     """Yield flat batches of steps, ``n`` in all."""
     width = max(1, env.batch_size.numel())

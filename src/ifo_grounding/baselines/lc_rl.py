@@ -1,0 +1,224 @@
+"""LC-RL (Fu et al. 2019): a reward from frames and instruction by maximum-entropy inverse RL.
+
+For tasks whose states are the arm's cells, ``move`` and ``move-udlr``, where dynamic programming is
+exact. It reads true actions, steps from demonstrations' states, and walks through the scenes in
+which it is measured.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from ifo_grounding import keys
+from ifo_grounding.baselines.access import SteppableActionDemonstrations
+from ifo_grounding.errors import UserError
+from ifo_grounding.modules import evaluating
+from ifo_grounding.networks import make_instruction_classifier
+from ifo_grounding.training.loop import Metrics
+from ifo_grounding.training.updates import make_optimizer, means, update
+
+UP, RIGHT, DOWN, LEFT = range(4)
+CHOICES = (UP, RIGHT, DOWN, LEFT, keys.STOP)
+"""What is planned with: the arm never picks."""
+
+
+def neighbours(size: int) -> Tensor:
+    """Return the cell that each move leads to from each of ``size`` x ``size``, int64 [cells, 4].
+
+    >>> neighbours(2).tolist()
+    [[0, 1, 2, 0], [1, 1, 3, 0], [0, 3, 2, 2], [1, 3, 3, 2]]
+    """
+    cell = torch.arange(size * size)
+    row, column = cell // size, cell % size
+    return torch.stack(
+        [
+            torch.where(row > 0, cell - size, cell),
+            torch.where(column < size - 1, cell + 1, cell),
+            torch.where(row < size - 1, cell + size, cell),
+            torch.where(column > 0, cell - 1, cell),
+        ],
+        1,
+    )
+
+
+def soft_values(reward: Tensor, moves: Tensor, horizon: int) -> Tensor:
+    """Return the log-probability of each choice in each cell, [*B, cells, 5], last the stop.
+
+    The stop is paid the reward of its cell, a move nothing; the episode ends after ``horizon``
+    moves at the latest. Entropy is that relative to chance, which else would make long walks worth
+    more than any goal. Differentiable, so that the likelihood of demonstrations trains the reward
+    (Ziebart et al. 2008).
+
+    Args:
+        reward: of stopping, [*B, cells].
+        moves: of :func:`neighbours`.
+
+    >>> reward = torch.tensor([0.0, 9.0, 0.0, 0.0])
+    >>> soft_values(reward, neighbours(2), horizon=3).argmax(-1).tolist()
+    [1, 4, 0, 0]
+    """
+    value = reward
+    for _ in range(horizon):
+        choices = torch.cat([value[..., moves], reward.unsqueeze(-1)], -1)
+        value = choices.logsumexp(-1) - math.log(len(CHOICES))
+    return choices.log_softmax(-1)
+
+
+def walk(env: EnvBase, scenes: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Visit every cell from the first states of scenes [rows], by steps of the simulator alone.
+
+    Returns:
+        What is seen from each cell, uint8 [rows, cells, C, H, W], and the instruction.
+    """
+    state = env.reset(TensorDict({keys.SCENE: scenes.unsqueeze(-1)}, env.batch_size))
+    instruction = state[keys.INSTRUCTION].clone()
+
+    def go(action: int) -> Tensor:
+        nonlocal state
+        state = env.step(state.set(keys.ACTION, torch.full(env.batch_size, action)))[keys.NEXT]
+        return state[keys.PIXELS]
+
+    for action in [UP] * (size - 1) + [LEFT] * (size - 1):
+        corner = go(action)
+    frames = corner.new_empty(len(corner), size * size, *corner.shape[1:])
+    frames[:, 0] = corner
+    row, column, there = 0, 0, RIGHT
+    for _ in range(size * size - 1):
+        at_edge = column == (size - 1 if there == RIGHT else 0)
+        if at_edge:
+            row, there, action = row + 1, LEFT if there == RIGHT else RIGHT, DOWN
+        else:
+            column, action = column + (1 if there == RIGHT else -1), there
+        frames[:, row * size + column] = go(action)
+    return frames, instruction
+
+
+class LCRL:
+    """Learns a reward of cells from demonstrations, and plans with it.
+
+    Args:
+        seen: true actions, and a simulator that begins where demonstrations began.
+        size: cells along one side of the world.
+        preset: of the reward network.
+        horizon: most moves of a plan.
+        options: for the network.
+
+    Raises:
+        UserError: where ``seen`` is anything else, or a demonstration does more than move.
+    """
+
+    access: type[Any] = SteppableActionDemonstrations
+
+    def __init__(
+        self,
+        seen: Any,
+        size: int = 6,
+        preset: str = "strong",
+        *,
+        lr: float = 1e-3,
+        horizon: int = 12,
+        **options: Any,
+    ) -> None:
+        if type(seen) is not self.access:
+            raise UserError(
+                f"{type(self).__name__} uses {self.access.__name__}, no more and no less, got "
+                f"{type(seen).__name__}"
+            )
+        self.seen, self.size, self.horizon = seen, size, horizon
+        self.moves = neighbours(size)
+        self.network: TensorDictModule = make_instruction_classifier(seen.demos, preset, **options)
+        self.optimizer = make_optimizer(self.network.parameters(), lr)
+        actions = seen.truth.actions.long()
+        if not torch.isin(actions, torch.tensor(CHOICES)).all():
+            raise UserError("LC-RL plans moves and a stop, and a demonstrator here did more")
+        self.choice = actions.where(actions != keys.STOP, len(CHOICES) - 1)
+        self.cells = self._cells()
+
+    def _walk(self, index: Tensor) -> tuple[Tensor, Tensor]:
+        """Walk through demonstrations' scenes, as many as there are rows or fewer."""
+        rows = self.seen.steps.env.batch_size.numel()
+        padded = torch.cat([index, index.new_zeros(rows - len(index))])
+        frames, instruction = walk(self.seen.steps.env, padded, self.size)
+        return frames[: len(index)], instruction[: len(index)]
+
+    def _cells(self) -> Tensor:
+        """Find where the arm is in each transition, by the frame alone: int64 [transitions]."""
+        demos, found = self.seen.demos, []
+        episode, frame = demos.locate()
+        for index in torch.arange(len(demos)).split(self.seen.steps.env.batch_size.numel()):
+            frames, _ = self._walk(index)
+            of_these = (episode >= index[0]) & (episode <= index[-1])
+            shown = demos.frames(frame[of_these])
+            same = (frames[episode[of_these] - index[0]] == shown.unsqueeze(1)).flatten(2).all(-1)
+            if not same.any(1).all():
+                raise UserError(
+                    "a demonstration changes its scene: LC-RL knows the arm's cell alone"
+                )
+            found.append(same.int().argmax(1))
+        return torch.cat(found)
+
+    def rewards(self, frames: Tensor, instruction: Tensor) -> Tensor:
+        """Return the reward of stopping in each cell, [rows, cells]."""
+        rows, cells = frames.shape[:2]
+        words = instruction.unsqueeze(1).expand(rows, cells, -1).flatten(0, 1)
+        batch = TensorDict(
+            {keys.PIXELS: frames.flatten(0, 1), keys.INSTRUCTION: words}, [rows * cells]
+        )
+        scored = self.network(batch).get(self.network.out_keys[0])
+        return scored.float().reshape(rows, cells)
+
+    def learn(self, steps: int, batch_size: int = 32, seed: int = 0) -> Metrics:
+        """Raise the likelihood of demonstrated choices; return mean metrics."""
+        source = torch.Generator().manual_seed(seed)
+        demos, updates = self.seen.demos, []
+        episode, _ = demos.locate()
+        self.network.train()
+        for _ in range(steps):
+            index = torch.randperm(len(demos), generator=source)[:batch_size].sort().values
+            frames, instruction = self._walk(index)
+            chosen = soft_values(self.rewards(frames, instruction), self.moves, self.horizon)
+            of_these = torch.isin(episode, index)
+            row = torch.searchsorted(index, episode[of_these])
+            told = chosen[row, self.cells[of_these], self.choice[of_these]]
+            losses = TensorDict({"loss_likelihood": -told.mean()})
+            updates.append(update(losses, self.optimizer, grad_clip=1.0))
+        self.network.eval()
+        return means(updates)
+
+    def success(self, env: EnvBase, episodes: int) -> Tensor:
+        """Plan in scenes 0 to ``episodes`` of an instructed world: success, bool [episodes]."""
+        found, rows = [], env.batch_size.numel()
+        for index in torch.arange(episodes).split(rows):
+            scenes = torch.cat([index, index.new_zeros(rows - len(index))])
+            frames, instruction = walk(env, scenes, self.size)
+            with evaluating(self.network):
+                parts = [
+                    soft_values(self.rewards(*part), self.moves, self.horizon).argmax(-1)
+                    for part in zip(frames.split(64), instruction.split(64), strict=True)
+                ]
+            plan = torch.cat(parts)
+            state = env.reset(TensorDict({keys.SCENE: scenes.unsqueeze(-1)}, env.batch_size))
+            begun = (frames == state[keys.PIXELS].unsqueeze(1)).flatten(2).all(-1)
+            cell, success = begun.int().argmax(1), torch.zeros(rows, dtype=torch.bool)
+            running = torch.ones(rows, dtype=torch.bool)
+            for _ in range(2 * self.horizon):
+                choice = plan.gather(1, cell.unsqueeze(1)).squeeze(1)
+                action = torch.tensor(CHOICES)[choice]
+                state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
+                paid = state[keys.REWARD].reshape(-1) > 0
+                success |= running & state["done"].reshape(-1) & paid
+                running &= ~state["done"].reshape(-1)
+                cell = torch.where(
+                    choice < 4,
+                    self.moves[cell].gather(1, choice.clamp(max=3).unsqueeze(1)).squeeze(1),
+                    cell,
+                )
+            found.append(success[: len(index)])
+        return torch.cat(found)
