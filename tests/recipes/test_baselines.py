@@ -12,7 +12,12 @@ from ifo_grounding.options import options_of
 from importing import recipes_importable
 from recipes.conftest import TINY, make_stages
 
-FEWER = ("baseline.frames=160", "baseline.steps=1", "demonstrations.n=20")
+FEWER = (
+    "baseline.frames=160",
+    "baseline.steps=1",
+    "demonstrations.n=20",
+    "baseline.likelihood_steps=2",
+)
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +39,13 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
     assert 0 <= results[method]["rate"]["rate"] <= 1 and results[method]["rate"]["count"] == 20
     trained = run / "stages" / f"baseline_{method}.json"
     if trained.exists():
-        rows = read_json(run / f"metrics/baseline_{method}.json")
+        found = read_json(trained)["result"]
         if method == "bco-alpha":
-            assert 0 <= read_json(trained)["result"]["labels_changed"] <= 1
+            assert 0 <= found["labels_changed"] <= 1
+        elif method == "lc-rl":
+            assert found["loss_likelihood"] > 0
         else:
+            rows = read_json(run / f"metrics/baseline_{method}.json")
             frames = sum(row["frames"] for row in rows)
             assert frames >= 160 and results["curve"][-1][0] == frames
         with pytest.raises(UserError, match="give another run="):
@@ -54,5 +62,7 @@ def test_a_rival_that_needs_what_a_world_lacks_says_so(practised, options, tmp_p
     shutil.rmtree(run / "truth")
     with pytest.raises(UserError, match="needs true actions"):
         baseline(options(*FEWER, "method=gail"))
+    with pytest.raises(UserError, match="task=move or"):
+        baseline(options(*FEWER, "method=lc-rl", "task=pick", run="another"))
     with pytest.raises(UserError, match="method"):
         options("method=dagger")
