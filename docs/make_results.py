@@ -7,7 +7,12 @@ from statistics import median
 from make_tables import TABLE_2, pieces
 from pages import NOT_RUN, Row, Runs, chosen, difference, gain, ran, rate, read, success, write
 
-from ifo_grounding.report import figure_png, markdown_table, rates_by_number
+from ifo_grounding.report import (
+    figure_png,
+    markdown_table,
+    rates_by_number,
+    training_curves,
+)
 from ifo_grounding.report.results import brief
 from ifo_grounding.stats import Rate, holm
 from ifo_grounding.tasks import TASKS
@@ -101,6 +106,54 @@ def babyai_rows() -> list[Row]:
     return rows
 
 
+ACCESS = {
+    "bc": ("yes", "no", "imitation of true actions"),
+    "lc-rl": ("yes", "yes", "reward by inverse RL, exact planning"),
+    "gail": ("yes", "no", "discriminator of actions"),
+    "gail+bc": ("yes", "no", "the same, from imitation of true actions"),
+    "agile": ("no", "yes", "discriminator of states"),
+    "agile-chosen": ("no", "no", "the same, chosen instructions in fresh states"),
+    "gaifo": ("no", "no", "discriminator of changes"),
+    "bco": ("no", "no", "imitation of inferred actions: phase 1"),
+    "bco-alpha": ("no", "no", "the same, labelled anew after steps of the policy"),
+    "ours": ("no", "no", "phase 1 and phase 2"),
+    "random": ("", "", "every action as likely"),
+    "expert": ("", "", "the demonstrator"),
+}
+"""Methods of Table 1: whether they may read true actions and step from demonstrations' states."""
+
+
+def by_method(task: str, number: int) -> dict[str, Runs]:
+    """Return the runs of each method of Table 1."""
+    found = read("baselines", lambda o: (o["task"], o["demonstrations"]["n"], o["method"]))
+    ours = {method: found.get((task, number, method)) for method in ACCESS}
+    return {method: runs for method, runs in ours.items() if runs}
+
+
+def baseline_rows(task: str, number: int) -> list[Row]:
+    rows = []
+    for method, runs in by_method(task, number).items():
+        actions, steps, what = ACCESS[method]
+        row = {"method": f"`{method}`", "what it is": what, "true actions": actions}
+        row |= {"steps from demonstrations": steps, "seeds": len(runs)}
+        curve = runs[0]["results"].get("curve")
+        row["frames of policy gradient"] = f"{curve[-1][0] / 1e6:.1f}M" if curve else ""
+        rows.append({**row, "success": brief(rate(runs, method))})
+    return rows
+
+
+def baseline_curves(task: str, number: int) -> bytes:
+    """Draw the success on validation scenes of each method that learns by policy gradient."""
+    history: dict[float, dict[str, float]] = {}
+    for method, runs in by_method(task, number).items():
+        for frames, reached in runs[0]["results"].get("curve", ()):
+            history.setdefault(frames, {"step": frames})[method] = reached
+    names = [name for name in ACCESS if any(name in row for row in history.values())]
+    rows = [history[frames] for frames in sorted(history)]
+    title = f"{task}, {number:,} demonstrations: success"
+    return figure_png(training_curves(rows, {title: {name: name for name in names}}))
+
+
 def minutes(runs: Runs) -> int:
     """Return how long the method and its evaluation took, without the references."""
     aside = ("imitate_truth", "evaluate_references")
@@ -120,10 +173,18 @@ def tables() -> dict[str, str]:
         "from-5000": [row for (_, number), row in studied.items() if number >= 5000],
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
+        "baselines": baseline_rows("move", 2000),
     }
     return {name: markdown_table(rows) for name, rows in found.items()}
 
 
 if __name__ == "__main__":
     babyai = figure_png(rates_by_number(curves(runs_of("babyai", LEVELS), POLICIES)))
-    write(tables(), {"efficiency.png": efficiency_picture(), "babyai.png": babyai})
+    write(
+        tables(),
+        {
+            "efficiency.png": efficiency_picture(),
+            "babyai.png": babyai,
+            "baselines.png": baseline_curves("move", 2000),
+        },
+    )

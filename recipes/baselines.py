@@ -19,6 +19,7 @@ from _shared import (
     load_demonstrations,
     load_labels,
     load_network,
+    open_run,
     open_stage,
     plain,
     save_network,
@@ -118,7 +119,7 @@ def trained(options: Options) -> Any:
     elif method == "bco-alpha":
         run = bco_alpha(options)
     else:
-        run = open_stage(options, "evaluate").run
+        run = open_run(options)
     known = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
     return load_network(run, known.get(method, file_of(method)), "baselines", options)
 

@@ -156,10 +156,10 @@ def test_help_of_a_recipe_shows_what_it_reads_and_has_of_its_own(capsys):
     assert "self_examine" not in printed and "ifo-grounding demo --help" in printed
     assert run("run", "reproduce", "table=2", "--help") == 0
     printed = capsys.readouterr().out
-    assert "\n  table=2 " in printed and "Of the paper: 2, 3 or 4." in printed
+    assert "\n  table=2 " in printed and "Of the paper: 1, with a success" in printed
     assert run("run", "reproduce", "preset=strong") == 2
     assert run("run", "reproduce", "table=7") == 2
-    assert "unknown table 7: choose one of 2, 3, 4" in capsys.readouterr().err
+    assert "unknown table 7: choose one of 1, 2, 3, 4" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("module", ["ifo_grounding", "ifo_grounding.cli"])

@@ -23,6 +23,7 @@ HELP = ("-h", "--help")
 COMMANDS = {
     "demo": ("two_phase", "train and compare both phases on one task, then write a report"),
     "evaluate": ("evaluate", "success rate of a trained policy, with its interval"),
+    "play": ("play", "tell a trained policy a sentence in a scene, and see what it does"),
     "record": ("record_demonstrations", "record observation-only demonstrations of a task"),
     "report": ("report", "tables, curves and animations of finished runs"),
 }

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from tensordict import TensorDictBase
+import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.envs.base import NumberedEnv
 from ifo_grounding.episodes import Outcomes, Policy
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation.scenes import Player, play_scenes
@@ -43,6 +45,7 @@ def record_episodes(
     env_or_task: EnvBase | str,
     scenes: Sequence[int] = range(8),
     *,
+    sentence: str | None = None,
     render_tile_size: int | None = None,
     **options: Any,
 ) -> list[Episode]:
@@ -56,12 +59,15 @@ def record_episodes(
         env_or_task: name of a task, or an instructed environment with as many rows as scenes are
             asked for. Those of :func:`~ifo_grounding.envs.from_gymnasium` have numbers.
         scenes: numbers of the scenes; of other environments the first ones, ``range(n)``.
+        sentence: what is asked in place of the scenes' own instructions, where the environment
+            takes one, as the library's own world does.
         render_tile_size: size of a cell in the kept frames, for people (16 or 32), for a task's
             name; what the policy sees where None.
         options: of :func:`success_rate`, such as ``mode``, ``seed``, ``stream`` and ``max_steps``.
 
     Raises:
-        UserError: where the environment has not one row for each scene.
+        UserError: where the environment has not one row for each scene, or does not take the
+            sentence.
 
     >>> import torch
     >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
@@ -81,6 +87,8 @@ def record_episodes(
             raise UserError(
                 f"the environment has {rows} rows for {len(scenes)} scenes: make it with as many"
             )
+        if sentence is not None:
+            start = _asked(env, scenes, sentence)
         frames.extend([frame] for frame in _seen(env, start.reshape(rows), render_tile_size))
         vocabulary: Vocabulary = attribute(env, "vocabulary", VOCABULARY)
         sentences.extend(vocabulary.decode(start.reshape(rows)[keys.INSTRUCTION].cpu()))
@@ -110,6 +118,19 @@ def record_episodes(
         )
         for row, number in enumerate(scenes)
     ]
+
+
+def _asked(env: EnvBase, scenes: Sequence[int], sentence: str) -> TensorDictBase:
+    """Begin scenes anew with a sentence of one's own."""
+    if not isinstance(env, NumberedEnv):
+        raise UserError(f"{type(env).__name__} takes no sentence of one's own at its reset")
+    tokens = env.vocabulary.encode([sentence]).expand(len(scenes), -1)
+    numbers = torch.tensor([*scenes]).unsqueeze(-1)
+    asked = TensorDict({keys.SCENE: numbers, keys.INSTRUCTION: tokens}, env.batch_size)
+    start = env.reset(asked.to(env.device or "cpu"))
+    if not torch.equal(start[keys.INSTRUCTION].cpu(), tokens):
+        raise UserError(f"this world takes no sentence of one's own: {env.own_sentence}")
+    return start
 
 
 def _seen(env: EnvBase, shown: TensorDictBase, tile_size: int | None) -> np.ndarray:
