@@ -120,6 +120,9 @@ class SteppableActionDemonstrations:
 class DemonstrationStarts(Transform):
     """Begins each episode with a scene drawn at random among the first ``count``."""
 
+    fixes_scenes = True
+    """The simulator keeps its seed, of which the demonstrations' scenes are."""
+
     def __init__(self, count: int, seed: int = 0) -> None:
         super().__init__()
         self.count = count
