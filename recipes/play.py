@@ -49,7 +49,7 @@ class PlayOptions:
     def __post_init__(self) -> None:
         check_choice("task", self.task, TASKS)
         check_choice("stream", self.stream, STREAMS)
-        check_range(self, "scene", least=0, most=2**31)
+        check_range(self, "scene", "seed", least=0, most=2**31)
         if self.to is not None and Path(self.to).suffix.lower() != ".gif":
             raise UserError(f"to={self.to} is a GIF: give it a name that ends in .gif")
 

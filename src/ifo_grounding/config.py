@@ -221,7 +221,7 @@ class EvaluateConfig:
         check_choice("stream", self.stream, STREAMS)
         check_choice("split", self.split, ("all", "train", "zero-shot"))
         check_range(self, "episodes", "audit_episodes", "max_steps", least=1)
-        check_range(self, "states", least=0)
+        check_range(self, "states", "seed", least=0)
 
 
 @dataclass

@@ -10,7 +10,7 @@ import itertools
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +38,20 @@ CONFIG = "config"
 """Name of the YAML that all recipes begin with."""
 MULTIRUN = ("-m", "--multirun")
 """One job for each combination of values that options name, such as ``seed=0,1``."""
-TEXTS = {
-    field.name: "null" if "None" in str(field.type) else ""
-    for field in dataclasses.fields(Options)
-    if "str" in str(field.type) and field.name not in ("preset", "budget", "threads")
-}
-"""Options that are texts, whatever is in them, and what stands for none."""
 READ = {"world_of": "world", "build": "networks", "chosen_by": "instruction"}
 """Sections that functions of recipes read."""
 
+
+def texts_of(kind: Any) -> dict[str, str]:
+    """Return the options that are texts, whatever is in them, and what stands for none."""
+    return {
+        field.name: "null" if "None" in str(field.type) else ""
+        for field in dataclasses.fields(kind)
+        if str(field.type).startswith("str") and field.name not in ("preset", "budget")
+    }
+
+
+TEXTS = texts_of(Options)
 STORE = ConfigStore.instance()
 STORE.store(name="options", node=Options)
 for world in (Grid, BabyAI, Gymnasium):
@@ -79,7 +84,9 @@ def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
     with _composing(script.parent):
         jobs = [words] if len(words) == len(arguments) else _combinations(words)
         if own:
-            return [OmegaConf.to_object(compose(script.stem, job)) for job in jobs]
+            texts = texts_of(OmegaConf.get_type(compose(script.stem)))
+            given = [[_text(word, texts) for word in job] for job in jobs]
+            return [OmegaConf.to_object(compose(script.stem, job)) for job in given]
         return [_settled(job) for job in jobs]
 
 
@@ -110,6 +117,13 @@ def quoted(word: str, several: bool = False) -> str:
     if as_it_is or value in ("", TEXTS.get(name, value)):
         return word
     return f"{name}={','.join(map(_quote, values))}"
+
+
+def _text(word: str, texts: Mapping[str, str]) -> str:
+    """Return an option of a recipe of its own: commas are part of a text, such as a sentence."""
+    name, _, value = word.partition("=")
+    as_it_is = value[:1] + value[1:][-1:] in ("''", '""') or value in ("", texts.get(name, value))
+    return word if as_it_is else f"{name}={_quote(value)}"
 
 
 def _quote(value: str) -> str:

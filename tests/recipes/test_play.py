@@ -26,7 +26,7 @@ def test_a_sentence_of_ones_own_is_followed(played, tmp_path):
     assert own["asked"] == "move to the yellow diamond" and own["fulfilled, in truth"] == "yes"
     assert own["suits, in truth"] == "suitable" and own["done"].endswith("S")
     with Image.open(tmp_path / "own.gif") as shown:
-        assert shown.n_frames == len(own["done"].split()) + 1
+        assert shown.n_frames == len(own["done"].split())
     other = played("scene=7", "to=null", "sentence='Move to the red diamond!'")
     assert other["asked"] == "move to the red diamond" and other["done"] == "D L S"
     assert "step by step" not in other
@@ -54,6 +54,8 @@ def test_the_networks_of_a_run_are_played(played, phase_1):
         (["run=never-made"], "there is no run never-made"),
         (["to=x.png"], "is a GIF"),
         (["scene=-1"], "scene must be at least 0"),
+        (["seed=-1"], "seed must be at least 0"),
+        (["sentence=<b>move</b>, to: #1 (it's)"], "unknown word"),
         (["task=fly"], "unknown task 'fly'"),
         (["level=3"], "level"),
     ],

@@ -80,7 +80,7 @@ def test_every_piece_is_a_call_that_demo_takes(reproduce_options, asked):
 @pytest.mark.parametrize(
     ("said", "refused"),
     [
-        ([], "name a table=2, 3 or 4"),
+        ([], "name a table=1, 2, 3 or 4"),
         (["table=7"], "unknown table 7"),
         (["table=2", "tasks=[fly]"], "unknown task 'fly'"),
         (["table=2", "presets=[film]"], "unknown preset 'film'"),

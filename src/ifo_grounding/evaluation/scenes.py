@@ -16,7 +16,7 @@ from ifo_grounding import keys, modules
 from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
 from ifo_grounding.episodes import Outcomes, Policy, play
-from ifo_grounding.errors import UserError, at_least_one, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_choice, whole
 from ifo_grounding.seeding import STREAMS, derive
 
 MAX_STEPS = 40
@@ -60,6 +60,8 @@ def play_scenes(
         The columns of ``play_batch``, of all scenes [N, ...] on the CPU, and the hash of the
         scenes' first frames and instructions.
     """
+    if whole("seed", seed) < 0:  # which a generator of TorchRL does not take
+        raise UserError(f"the seed of scenes must be at least 0, got {seed}")
     if isinstance(env_or_task, str):
         limit = MAX_STEPS if max_steps is None else at_least_one("max_steps", max_steps)
         env: EnvBase = PickAndPlaceEnv(
