@@ -173,14 +173,14 @@ def bco_alpha(options: Options) -> Run:
 def planned(options: Options) -> LCRL:
     """Return LC-RL with the reward that it learned, learned now if it has to be."""
     stage, world = trained_by(options), world_of(options)
-    if options.task not in ("move", "move-udlr") or not hasattr(world, "steppable"):
+    if options.task not in ("move", "move-udlr"):
         raise UserError("lc-rl plans the arm's cells: task=move or task=move-udlr")
     run, demos = stage.run, load_demonstrations(stage.run)
     env = world.steppable(ROWS, seed=options.seed)
     truth = Truth.load(run.need(TRUTH, "record_demonstrations"))
     seen = SteppableActionDemonstrations(SteppableDemonstrations(demos, env), truth)
     how = {"seed": options.seed, **options.networks.changed()}
-    planner = LCRL(seen, world.size, options.preset, **how)
+    planner = LCRL(seen, options.world["size"], options.preset, **how)
     file = file_of("lc-rl")
     if stage.result is None:
         found = planner.learn(options.baseline.likelihood_steps, ROWS, options.seed)
@@ -267,11 +267,6 @@ def access(options: Options, run: Run) -> Any:
             raise UserError(f"{options.method} needs true actions, and these were not recorded")
         return ActionDemonstrations(demos, Truth.load(run / TRUTH))
     if kind is SteppableDemonstrations:
-        if not hasattr(world, "steppable"):
-            raise UserError(
-                f"{options.method} steps from demonstrations' states: {type(world).__name__} has "
-                "no method steppable(num_envs, seed=, device=)"
-            )
         worlds = options.self_examine.num_envs
         env = world.steppable(worlds, seed=options.seed, device=options.device)
         return SteppableDemonstrations(demos, env)

@@ -21,9 +21,9 @@ from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import from_pretrained
 from ifo_grounding.options import options_of
 from ifo_grounding.seeding import STREAMS
-from ifo_grounding.tasks import REASONS, TASKS, grammar, verdict
+from ifo_grounding.tasks import TASKS
 from ifo_grounding.training import Run
-from ifo_grounding.worlds import Grid
+from ifo_grounding.worlds import World
 
 
 @dataclass
@@ -70,8 +70,8 @@ def play(options: PlayOptions) -> dict[str, Any]:
     seen = {keys.PIXELS: frames[:1], keys.INSTRUCTION: said}
     if "instruction" in networks:
         found["suits, by the instruction classifier"] = asked(networks["instruction"], seen)
-    if isinstance(world, Grid):
-        found["suits, in truth"] = truth(world, said, options)
+    if world.oracle is not None:
+        found["suits, in truth"] = world.oracle.suits(said[0], options.scene, **how)
     found["done"] = " ".join(world.actions[action] for action in episode.actions)
     seen |= {keys.INITIAL_PIXELS: frames[:1], keys.PIXELS: frames[-1:]}
     if "goal" in networks:
@@ -87,12 +87,13 @@ def play(options: PlayOptions) -> dict[str, Any]:
     return found
 
 
-def trained(options: PlayOptions) -> tuple[dict[str, Any], Any]:
+def trained(options: PlayOptions) -> tuple[dict[str, Any], World]:
     """Return the networks that are played, and their world."""
     if options.run is None:
         kinds = ("policy", "instruction", "goal")
         of = f"ifo-grounding/{options.task}"
-        return {kind: from_pretrained(of, kind=kind) for kind in kinds}, Grid(options.task)
+        world = world_of(options_of(f"task={options.task}"))
+        return {kind: from_pretrained(of, kind=kind) for kind in kinds}, world
     run = Run(options.run)
     if run.options() is None:
         raise UserError(
@@ -114,14 +115,6 @@ def asked(network: Any, seen: dict[str, Any]) -> str:
     with evaluating(network):
         logit = network(TensorDict(seen, [1]).select(*network.in_keys))[network.out_keys[0]]
     return f"{float(logit.sigmoid()):.0%}"
-
-
-def truth(world: Grid, said: torch.Tensor, options: PlayOptions) -> str:
-    """Say whether an instruction suits the scene, or why not."""
-    env = world.instructed(1, seed=options.seed, stream=options.stream)
-    env.reset(TensorDict({keys.SCENE: torch.tensor([[options.scene]])}, [1]))
-    goal = grammar(world.task).parse_tokens(said)
-    return REASONS[int(verdict(env.truth.state, goal))]
 
 
 @recipe_main

@@ -22,7 +22,7 @@ from ifo_grounding.data import record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
 from ifo_grounding.training.reseeding import reseed
-from ifo_grounding.worlds import Grid
+from ifo_grounding.worlds import Grid, World
 
 SMALL = {"features": 8, "seed": 0}
 
@@ -90,6 +90,11 @@ def test_another_simulator_is_refused(sources):
     for index in ([0, 1], [0, 1, 2, 3, 12], [-1, 0, 1, 2, 3]):
         with pytest.raises(UserError, match="number of one of 12 demonstrations"):
             sources["steps"].reset(index)
+
+
+def test_a_world_that_cannot_go_back_says_so():
+    with pytest.raises(UserError, match="cannot begin where a demonstration began"):
+        World.steppable(Grid("move"), 2, seed=0)
 
 
 def steps(*logits, said=None):

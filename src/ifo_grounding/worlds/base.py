@@ -28,6 +28,9 @@ class Oracle(Protocol):
     def endings(self, policy: nn.Module, episodes: int, **scenes: Any) -> Endings:
         """Say how the policy's episodes end."""
 
+    def suits(self, instruction: Tensor, scene: int, *, seed: int, stream: str) -> str:
+        """Say whether an instruction suits a scene, ``suitable``, or why not."""
+
     def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
         """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
 
@@ -94,6 +97,16 @@ class World(ABC):
             f"{type(self).__name__} makes no demonstrations: give recorded=FOLDER, a folder that "
             "Demonstrations.save or save_pictures wrote"
         )
+
+    def steppable(self, num_envs: int, *, seed: int, device: str = "cpu") -> EnvBase:
+        """Return worlds whose scene number i is the first state of demonstration i of a seed.
+
+        For rivals that may step from demonstrations' states, as no learner of ours may.
+
+        Raises:
+            UserError: where the world cannot go back to them.
+        """
+        raise UserError(f"{type(self).__name__} cannot begin where a demonstration began")
 
     def demonstrator(self, episodes: int, *, seed: int, stream: str) -> Tensor:
         """Return the demonstrator's own success in the scenes of a stream, bool [episodes].

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from omegaconf import MISSING
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from ifo_grounding import keys
@@ -16,7 +17,7 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Endings, SuitabilityResult, episode_endings, suitable_rate
 from ifo_grounding.seeding import derive
-from ifo_grounding.tasks import VOCABULARY, grammar
+from ifo_grounding.tasks import REASONS, VOCABULARY, grammar, verdict
 from ifo_grounding.world import Layout
 from ifo_grounding.worlds.base import World
 
@@ -82,10 +83,7 @@ class Grid(World):
         return torch.ones(episodes, dtype=torch.bool)
 
     def steppable(self, num_envs: int, *, seed: int, **options: Any) -> PickAndPlaceEnv:
-        """Return worlds whose scene number i is the first state of demonstration i of a seed.
-
-        For methods that may step from demonstrations' states, as ours may not.
-        """
+        """Return worlds that begin where demonstrations of this seed began; see :class:`World`."""
         return PickAndPlaceEnv(
             self.task, num_envs, seed=derive(seed, "demonstrations"), **self.scenes(**options)
         )
@@ -107,6 +105,13 @@ class Grid(World):
         """Say how the policy's episodes end."""
         options = self.scenes(episodes=episodes, **scenes)
         return episode_endings(policy, self.task, **options)
+
+    def suits(self, instruction: Tensor, scene: int, *, seed: int, stream: str) -> str:
+        """Say whether an instruction suits a scene, ``suitable``, or why not."""
+        env = self.instructed(1, seed=seed, stream=stream)
+        env.reset(TensorDict({keys.SCENE: torch.tensor([[scene]])}, [1]))
+        goal = grammar(self.task).parse_tokens(instruction.reshape(1, -1))
+        return REASONS[int(verdict(env.truth.state, goal))]
 
     def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
         """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
