@@ -17,6 +17,7 @@ from torchrl import torchrl_logger
 
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
+from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport
 from ifo_grounding.errors import UserError
@@ -274,7 +275,9 @@ def write_result(options: Options, results: dict[str, Any], name: str) -> dict[s
     from ifo_grounding.report import provenance  # reports are slow to import
 
     run = open_run(options)
-    records = run.records()
+    others = {f"{stage}_{method}" for method in METHODS for stage in ("baseline", "evaluate")}
+    others -= {f"baseline_{options.method}", f"evaluate_{options.method}"}
+    records = {name: record for name, record in run.records().items() if name not in others}
     content = {
         "command": command(name),
         "options": plain(options),
