@@ -9,11 +9,12 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, RandomPolicy, set_exploration_type
+from torchrl.envs.utils import ExplorationType, RandomPolicy
 
 from ifo_grounding import keys
 from ifo_grounding.attributes import untransformed
 from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.modules import exploring
 from ifo_grounding.progress import progress_bar
 
 MODES = {"greedy": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
@@ -80,7 +81,7 @@ def play(
     active = torch.arange(rows, **on)
     true_reward = keys.REWARD if keys.REWARD in env.reward_keys else env.reward_keys[0]
     state = start
-    with set_exploration_type(MODES[mode]):
+    with exploring(MODES[mode]):
         for _ in progress_bar(iter(range(max_steps)), "play", leave=False):
             state[env.action_key] = _actions(policy, env, state, active)
             stepped = env.step(state)

@@ -11,18 +11,20 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import ACTION_SCORE, GOAL_SCORE, SUITABILITY
 
-_MODES = threading.RLock()  # while it is held, a module may be in another mode than its own
+TURNS = threading.RLock()
+"""While it is held, modules may be in another mode than their own, and policies act greedily."""
 
 
 @contextlib.contextmanager
 def in_mode(training: bool, *modules: object) -> Iterator[None]:
     """Run a block with modules in train or eval mode; every submodule gets its own mode back."""
     parts = [part for m in modules if isinstance(m, nn.Module) for part in m.modules()]
-    with _MODES:
+    with TURNS:
         before = [part.training for part in parts]
         try:
             for part in parts:
@@ -45,6 +47,16 @@ def evaluating(*modules: object) -> Iterator[None]:
     [True, False]
     """
     with in_mode(False, *modules), torch.no_grad():
+        yield
+
+
+@contextlib.contextmanager
+def exploring(kind: ExplorationType) -> Iterator[None]:
+    """Let policies act greedily, or by chance, while the block lasts.
+
+    TorchRL keeps one such choice for all threads, which therefore take turns.
+    """
+    with TURNS, set_exploration_type(kind):
         yield
 
 

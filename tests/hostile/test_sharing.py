@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import exploration_type
 
 from ifo_grounding import networks
 from ifo_grounding.data import label_demonstrations, labelled_buffer, record_demonstrations
@@ -66,8 +67,9 @@ USES = (imitation_loss, chosen, paid, labelled, succeeded, practised)
 
 
 def modes(parts):
+    """Return the mode of each module, and how policies act."""
     made = (part for part in parts.values() if isinstance(part, torch.nn.Module))
-    return [module.training for part in made for module in part.modules()]
+    return [exploration_type(), *(module.training for part in made for module in part.modules())]
 
 
 @pytest.mark.parametrize("training", [True, False])

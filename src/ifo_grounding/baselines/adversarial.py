@@ -147,7 +147,6 @@ class Adversary:
         seen: what the method may use; another kind is refused.
         preset: of the network.
         steps: gradient steps after each iteration.
-        spare: see :class:`DiscriminatorLoss`.
         stop_action: the action by which a policy ends an episode.
         options: for the network, such as ``seed`` and ``device``.
 

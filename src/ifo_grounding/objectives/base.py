@@ -14,7 +14,7 @@ from torchrl.objectives.common import LossModule
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import has_word_penalty, in_mode, output_key
+from ifo_grounding.modules import TURNS, has_word_penalty, in_mode, output_key
 
 
 @dataclass
@@ -54,6 +54,11 @@ class SupervisedLoss(LossModule):
         self.own_keys: list[NestedKey] = list(network.in_keys)
         self.reduction = "mean"
         self.output = None if self.written is None else output_key(network, self.written)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Compute the loss. TorchRL sets meanwhile how policies act, for all threads: in turns."""
+        with TURNS:
+            return super().__call__(*args, **kwargs)
 
     @property
     def default_keys(self) -> Any:

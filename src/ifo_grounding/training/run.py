@@ -135,8 +135,13 @@ class Run:
             UserError: where its ``config.yaml`` is damaged.
         """
         path = self / OPTIONS
-        if not path.exists():
-            return None
+        try:
+            if not path.exists():
+                return None
+        except OSError as error:  # a name that is too long
+            raise UserError(
+                f"run={self.name!s:.40}... names no folder ({error.strerror})"
+            ) from None
         from omegaconf import OmegaConf
 
         try:

@@ -12,13 +12,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from ifo_grounding import keys
 from ifo_grounding.data.buffers import FINAL
 from ifo_grounding.episodes import play
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import beside, evaluating
+from ifo_grounding.modules import beside, evaluating, exploring
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.loop import Metrics
 from ifo_grounding.training.reseeding import reseed, sampler_stats, stored_starts
@@ -133,7 +133,7 @@ class HeldOutAccuracy:
     def measure(self) -> Tensor:
         """Return the share of each demonstration's actions that the policy takes, float32 [D]."""
         right, final = [], []
-        with evaluating(self.policy), set_exploration_type(ExplorationType.DETERMINISTIC):
+        with evaluating(self.policy), exploring(ExplorationType.DETERMINISTIC):
             for rows in torch.arange(len(self.buffer)).split(self.batch_size):
                 seen = beside(self.buffer[rows], self.policy)
                 label = seen.pop(keys.ACTION)
