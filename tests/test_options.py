@@ -174,3 +174,9 @@ def test_help_lists_values_and_meanings():
     assert any(line.split() == ["imitate.steps=7", "Gradient", "steps."] for line in lines)
     assert any(line.startswith("\nself_examine: Self-examination") for line in lines)
     assert max(len(line) for line in lines) <= 110
+
+
+def test_tiny_records_and_plays_little_on_every_level():
+    tiny = options_of("world=babyai", "level=BossLevel", "budget=tiny")
+    assert tiny.demonstrations.n <= 16  # its bot takes half a minute for these
+    assert tiny.evaluate.max_steps * tiny.evaluate.episodes <= 1000
