@@ -52,17 +52,17 @@ def test_a_method_uses_its_row_of_table_1_no_more_and_no_less(method, allowed, s
 
 def test_only_those_that_may_see_actions_hold_any(sources):
     held = {
-        method: set(method(sources[name], **SMALL).buffer[:].keys(True, True))
+        method: set(method(sources[name], **SMALL).demonstrations[:].keys(True, True))
         for method, name in ((GAIL, "actions"), (GAIfO, "frames"), (AGILE, "steps"))
     }
     assert "action" in held[GAIL]
     assert "action" not in held[GAIfO] | held[AGILE]
     truth = sources["actions"].truth.actions
-    assert torch.equal(GAIL(sources["actions"], **SMALL).buffer[:]["action"], truth.long())
+    assert torch.equal(GAIL(sources["actions"], **SMALL).demonstrations[:]["action"], truth.long())
 
 
 def test_agile_reads_last_frames_alone(sources):
-    shown = AGILE(sources["steps"], **SMALL).buffer[:]
+    shown = AGILE(sources["steps"], **SMALL).demonstrations[:]
     demos = sources["frames"]
     last = demos.frames(demos.starts + demos.lengths - 1)
     assert torch.equal(shown["next", "pixels"], last)

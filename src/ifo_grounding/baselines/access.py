@@ -36,6 +36,22 @@ def transitions_of(demos: Demonstrations, last: bool = False) -> TensorDictRepla
     return frame_buffer(demos, stored, [keys.PIXELS, AFTER])
 
 
+def check_access(method: object, seen: object, allowed: type) -> None:
+    """Refuse a source that gives less than a method needs, or more than it may use."""
+    if type(seen) is not allowed:
+        raise UserError(
+            f"{type(method).__name__} uses {allowed.__name__}, no more and no less, got "
+            f"{type(seen).__name__}"
+        )
+
+
+def begin(env: EnvBase, scenes: Tensor) -> TensorDictBase:
+    """Reset every row to a scene by its number, int64 [R]; rows beyond R show scene 0."""
+    rows = env.batch_size.numel()
+    numbers = torch.cat([scenes, scenes.new_zeros(rows - len(scenes))]).to(env.device or "cpu")
+    return env.reset(TensorDict({keys.SCENE: numbers.view(*env.batch_size, 1)}, env.batch_size))
+
+
 @dataclass(frozen=True)
 class ActionDemonstrations:
     """Frames, instruction and the demonstrator's true actions: for GAIL and behavioural cloning.
@@ -76,9 +92,8 @@ class SteppableDemonstrations:
 
     def __init__(self, demos: Demonstrations, env: EnvBase) -> None:
         self.demos, self.env = demos, env
-        rows = env.batch_size.numel()
-        for index in torch.arange(len(demos)).split(rows):
-            shown = self.reset([*index.tolist(), *[0] * (rows - len(index))])[: len(index)]
+        for index in torch.arange(len(demos)).split(env.batch_size.numel()):
+            shown = begin(env, index)[: len(index)]
             same = shown[keys.PIXELS].cpu() == demos.frames(demos.starts[index])
             if not same.all() or not torch.equal(
                 shown[keys.INSTRUCTION].cpu(), demos.instructions[index].long()
@@ -96,8 +111,7 @@ class SteppableDemonstrations:
                 f"give the number of one of {len(self.demos)} demonstrations for each of "
                 f"{self.env.batch_size.numel()} rows, got {index.tolist()!r:.60}"
             )
-        scenes = TensorDict({keys.SCENE: index.unsqueeze(-1)}, self.env.batch_size)
-        return self.env.reset(scenes)
+        return begin(self.env, index)
 
     def starts(self, seed: int = 0) -> TransformedEnv:
         """Return the simulator with every episode begun in a demonstration drawn at random."""

@@ -22,19 +22,18 @@ from ifo_grounding.baselines.access import (
     AFTER,
     ActionDemonstrations,
     SteppableDemonstrations,
+    check_access,
     transitions_of,
 )
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.errors import UserError, share
-from ifo_grounding.modules import beside
 from ifo_grounding.networks import (
     make_goal_classifier,
     make_instruction_classifier,
     make_reward_model,
 )
 from ifo_grounding.objectives.base import SupervisedLoss
-from ifo_grounding.training.loop import Metrics
-from ifo_grounding.training.updates import make_optimizer, means, update
+from ifo_grounding.training import AdversarialUpdates
 from ifo_grounding.transforms.base import rows_of
 from ifo_grounding.transforms.reward import RewardTransform
 
@@ -140,7 +139,7 @@ def frames_of(seen: Any) -> Demonstrations:
     return demos
 
 
-class Adversary:
+class Adversary(AdversarialUpdates):
     """A discriminator, its reward, and the updates between two iterations of policy gradient.
 
     Args:
@@ -173,18 +172,11 @@ class Adversary:
         stop_action: int | None = keys.STOP,
         **options: Any,
     ) -> None:
-        if type(seen) is not self.access:
-            raise UserError(
-                f"{type(self).__name__} uses {self.access.__name__}, no more and no less, got "
-                f"{type(seen).__name__}"
-            )
-        demos = frames_of(seen)
-        self.buffer = self.demonstrated(seen)
-        self.network = self.discriminator(demos, preset, **options)
-        self.loss = DiscriminatorLoss(self.network, spare=self.spare, swapped=swapped)
+        check_access(self, seen, self.access)
+        self.network = self.discriminator(frames_of(seen), preset, **options)
         self.reward = self.paid(stop_action)
-        self.optimizer = make_optimizer(self.loss.parameters(), lr)
-        self.steps, self.batch_size = steps, batch_size
+        loss = DiscriminatorLoss(self.network, spare=self.spare, swapped=swapped)
+        super().__init__(loss, self.demonstrated(seen), steps, lr, batch_size)
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:
         """Return the demonstrated steps that are told apart from the policy's."""
@@ -198,16 +190,10 @@ class Adversary:
         """Return the transform that pays."""
         return DiscriminatorReward(self.network)
 
-    def __call__(self, batch: TensorDictBase) -> Metrics:
-        """Train on the policy's steps [N, T]; return mean metrics, named ``reward/...``."""
-        own, updates = batch.reshape(-1), []
-        self.network.train()
-        for _ in range(self.steps):
-            rows = torch.randint(len(own), (self.batch_size,))
-            shown = beside(self.buffer.sample(self.batch_size), self.loss)
-            updates.append(update(self.loss(shown, own[rows]), self.optimizer, grad_clip=1.0))
-        self.network.eval()
-        return {f"reward/{name}": value for name, value in means(updates).items()}
+    def losses(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
+        """Compute the loss of a batch of demonstrated steps and one of the policy's."""
+        found: TensorDict = self.loss(demonstrations, policy)
+        return found
 
 
 class GAIL(Adversary):

@@ -17,7 +17,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.baselines.access import SteppableActionDemonstrations
+from ifo_grounding.baselines.access import (
+    SteppableActionDemonstrations,
+    begin,
+    check_access,
+)
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import make_instruction_classifier
@@ -72,12 +76,15 @@ def soft_values(reward: Tensor, moves: Tensor, horizon: int) -> Tensor:
 
 
 def walk(env: EnvBase, scenes: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Visit every cell from the first states of scenes [rows], by steps of the simulator alone.
+    """Visit every cell from the first states of scenes, by steps of the simulator alone.
+
+    Args:
+        scenes: numbers, int64 [R], as many as the env has rows or fewer.
 
     Returns:
-        What is seen from each cell, uint8 [rows, cells, C, H, W], and the instruction.
+        What is seen from each cell, uint8 [R, cells, C, H, W], and the instruction.
     """
-    state = env.reset(TensorDict({keys.SCENE: scenes.unsqueeze(-1)}, env.batch_size))
+    state = begin(env, scenes)
     instruction = state[keys.INSTRUCTION].clone()
 
     def go(action: int) -> Tensor:
@@ -97,7 +104,7 @@ def walk(env: EnvBase, scenes: Tensor, size: int) -> tuple[Tensor, Tensor]:
         else:
             column, action = column + (1 if there == RIGHT else -1), there
         frames[:, row * size + column] = go(action)
-    return frames, instruction
+    return frames[: len(scenes)], instruction[: len(scenes)]
 
 
 class LCRL:
@@ -126,11 +133,7 @@ class LCRL:
         horizon: int = 12,
         **options: Any,
     ) -> None:
-        if type(seen) is not self.access:
-            raise UserError(
-                f"{type(self).__name__} uses {self.access.__name__}, no more and no less, got "
-                f"{type(seen).__name__}"
-            )
+        check_access(self, seen, self.access)
         self.seen, self.size, self.horizon = seen, size, horizon
         self.moves = neighbours(size)
         self.network: TensorDictModule = make_instruction_classifier(seen.demos, preset, **options)
@@ -141,19 +144,12 @@ class LCRL:
         self.choice = actions.where(actions != keys.STOP, len(CHOICES) - 1)
         self.cells = self._cells()
 
-    def _walk(self, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Walk through demonstrations' scenes, as many as there are rows or fewer."""
-        rows = self.seen.steps.env.batch_size.numel()
-        padded = torch.cat([index, index.new_zeros(rows - len(index))])
-        frames, instruction = walk(self.seen.steps.env, padded, self.size)
-        return frames[: len(index)], instruction[: len(index)]
-
     def _cells(self) -> Tensor:
         """Find where the arm is in each transition, by the frame alone: int64 [transitions]."""
         demos, found = self.seen.demos, []
         episode, frame = demos.locate()
         for index in torch.arange(len(demos)).split(self.seen.steps.env.batch_size.numel()):
-            frames, _ = self._walk(index)
+            frames, _ = walk(self.seen.steps.env, index, self.size)
             of_these = (episode >= index[0]) & (episode <= index[-1])
             shown = demos.frames(frame[of_these])
             same = (frames[episode[of_these] - index[0]] == shown.unsqueeze(1)).flatten(2).all(-1)
@@ -182,7 +178,7 @@ class LCRL:
         self.network.train()
         for _ in range(steps):
             index = torch.randperm(len(demos), generator=source)[:batch_size].sort().values
-            frames, instruction = self._walk(index)
+            frames, instruction = walk(self.seen.steps.env, index, self.size)
             chosen = soft_values(self.rewards(frames, instruction), self.moves, self.horizon)
             of_these = torch.isin(episode, index)
             row = torch.searchsorted(index, episode[of_these])
@@ -195,8 +191,8 @@ class LCRL:
     def success(self, env: EnvBase, episodes: int) -> Tensor:
         """Plan in scenes 0 to ``episodes`` of an instructed world: success, bool [episodes]."""
         found, rows = [], env.batch_size.numel()
-        for index in torch.arange(episodes).split(rows):
-            scenes = torch.cat([index, index.new_zeros(rows - len(index))])
+        for first in range(0, episodes, rows):
+            scenes = torch.arange(first, first + rows).clamp(max=episodes - 1)
             frames, instruction = walk(env, scenes, self.size)
             with evaluating(self.network):
                 parts = [
@@ -204,7 +200,7 @@ class LCRL:
                     for part in zip(frames.split(64), instruction.split(64), strict=True)
                 ]
             plan = torch.cat(parts)
-            state = env.reset(TensorDict({keys.SCENE: scenes.unsqueeze(-1)}, env.batch_size))
+            state = begin(env, scenes)
             begun = (frames == state[keys.PIXELS].unsqueeze(1)).flatten(2).all(-1)
             cell, success = begun.int().argmax(1), torch.zeros(rows, dtype=torch.bool)
             running = torch.ones(rows, dtype=torch.bool)
@@ -220,5 +216,5 @@ class LCRL:
                     self.moves[cell].gather(1, choice.clamp(max=3).unsqueeze(1)).squeeze(1),
                     cell,
                 )
-            found.append(success[: len(index)])
-        return torch.cat(found)
+            found.append(success)
+        return torch.cat(found)[:episodes]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding.errors import check_range
 from ifo_grounding.modules import beside
-from ifo_grounding.objectives import ImitationLoss, RewardLoss
+from ifo_grounding.objectives import ImitationLoss, SupervisedLoss
 from ifo_grounding.training.loop import Metrics
 from ifo_grounding.training.updates import make_optimizer, means, update
 
@@ -44,21 +44,6 @@ class AuxiliaryImitation:
         return self.weight * self.loss(batch)["loss_imitation"]
 
 
-class Adversarial(Protocol):
-    """What learns a reward on while the policy improves, and is kept in checkpoints."""
-
-    @property
-    def loss(self) -> nn.Module:
-        """What is minimised; it holds the network."""
-
-    @property
-    def optimizer(self) -> torch.optim.Optimizer:
-        """What minimises it."""
-
-    def __call__(self, batch: TensorDictBase) -> Metrics:
-        """Train on the policy's steps [N, T] and return metrics."""
-
-
 class AdversarialUpdates:
     """Trains the reward model on while the policy improves (paper, "Reward Module").
 
@@ -70,9 +55,11 @@ class AdversarialUpdates:
         batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
     """
 
+    loss: Any
+
     def __init__(
         self,
-        loss: RewardLoss,
+        loss: SupervisedLoss,
         demonstrations: ReplayBuffer,
         steps: int,
         lr: float,
@@ -88,6 +75,11 @@ class AdversarialUpdates:
         for _ in range(self.steps):
             rows = torch.randint(len(policy_steps), (self.batch_size,))
             shown = beside(self.demonstrations.sample(self.batch_size), self.loss)
-            losses = self.loss.adversarial(shown, policy_steps[rows])
+            losses = self.losses(shown, policy_steps[rows])
             updates.append(update(losses, self.optimizer, grad_clip=1.0))
         return {f"reward/{key}": value for key, value in means(updates).items()}
+
+    def losses(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
+        """Compute the loss of a batch of demonstrated steps and one of the policy's."""
+        found: TensorDict = self.loss.adversarial(demonstrations, policy)
+        return found

@@ -17,7 +17,7 @@ from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.attributes import first_worker, untransformed
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.seeding import derive
-from ifo_grounding.training.auxiliary import Adversarial, AuxiliaryImitation
+from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
 from ifo_grounding.training.checkpoint import Checkpoint
 from ifo_grounding.training.loop import Log, Loop, Metrics
 from ifo_grounding.training.policy_gradient import Learner
@@ -127,7 +127,7 @@ def improve_policy(
     config: SelfExaminationConfig,
     *,
     seed: int,
-    adversarial: Adversarial | None = None,
+    adversarial: AdversarialUpdates | None = None,
     imitation: AuxiliaryImitation | None = None,
     held_out: HeldOutAccuracy | None = None,
     checkpoint: str | Path | None = None,
@@ -217,7 +217,7 @@ def improve_policy(
 def _check(
     env: EnvBase,
     config: SelfExaminationConfig,
-    adversarial: Adversarial | None,
+    adversarial: AdversarialUpdates | None,
     held_out: HeldOutAccuracy | None,
 ) -> None:
     """Refuse an env that lacks something, and a selection that is impossible."""
