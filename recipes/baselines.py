@@ -7,7 +7,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import torch
 from _shared import (
     INVERSE,
     POLICIES,
@@ -32,11 +31,10 @@ from evaluate import measured_success, played, success_results
 from imitate import imitate_transitions, split_transitions
 from references import imitate_truth
 from self_examine import chosen_starts
-from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import RandomPolicy
 from two_phase import stages_of
 
-from ifo_grounding import keys
 from ifo_grounding.baselines import (
     AGILE,
     GAIL,
@@ -109,7 +107,8 @@ def trained(options: Options) -> Any:
     if method == "expert":
         return None
     if method == "random":
-        return uniform_policy(options)
+        env, _ = played(options, options.evaluate.episodes)
+        return RandomPolicy(env.action_spec)
     if method == "lc-rl":
         return planned(options)
     if method == "bc":
@@ -127,18 +126,6 @@ def trained(options: Options) -> Any:
 def file_of(method: str) -> str:
     """Return the file of the policy of an adversarial method."""
     return f"policy-{method}.safetensors"
-
-
-def uniform_policy(options: Options) -> Any:
-    """Return a policy that takes every action as often."""
-    policy = build(make_policy, options)
-    count = len(world_of(options).actions)
-
-    def undecided(pixels: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(len(pixels), count, device=pixels.device)
-
-    policy.module[0] = TensorDictModule(undecided, [keys.PIXELS], [keys.LOGITS])
-    return policy
 
 
 def bco_alpha(options: Options) -> Run:
