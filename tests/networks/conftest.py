@@ -57,3 +57,15 @@ def nested_keys(module) -> dict:
     if "action" in module.out_keys:
         return {**keys, "action_key": ("agent", "choice"), "logits_key": ("agent", "scores")}
     return {**keys, "out_key": ("agent", "said")}
+
+
+def tiled(rows, height=6, width=6, kinds=9, channels=3):
+    """Images of tiles of noise, some alike in what a neighbour sees of them."""
+    draw = torch.Generator().manual_seed(0)
+    tiles = torch.randint(256, (kinds, channels, 8, 8), generator=draw, dtype=torch.uint8)
+    tiles[1::2, :, :, 5:] = tiles[0, :, :, 5:]
+    tiles[2::3, :, 5:] = tiles[0, :, 5:]
+    which = torch.randint(kinds, (rows, height, width), generator=draw)
+    which[torch.rand(which.shape, generator=draw) < 0.6] = 0
+    cells = tiles[which].permute(0, 3, 1, 4, 2, 5)
+    return cells.reshape(rows, channels, 8 * height, 8 * width)

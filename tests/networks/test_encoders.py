@@ -6,6 +6,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.networks import ConvEncoder, NetworkConfig, PatchEncoder, Shapes, make_policy
 from ifo_grounding.networks.patches import distinct_views, distinct_windows
 from ifo_grounding.networks.shapes import grid_of
+from networks.conftest import tiled
 
 
 def test_conv_encoder_is_the_papers():
@@ -18,18 +19,6 @@ def test_conv_encoder_is_the_papers():
         features = encoder(torch.zeros(1, 3, height, width))
         config = NetworkConfig.of("policy", "paper")
         assert tuple(features.shape[-2:]) == grid_of(Shapes((3, height, width), 9), config)
-
-
-def tiled(rows, height=6, width=6, kinds=9, channels=3):
-    """Images of tiles of noise, some alike in what a neighbour sees of them."""
-    draw = torch.Generator().manual_seed(0)
-    tiles = torch.randint(256, (kinds, channels, 8, 8), generator=draw, dtype=torch.uint8)
-    tiles[1::2, :, :, 5:] = tiles[0, :, :, 5:]
-    tiles[2::3, :, 5:] = tiles[0, :, 5:]
-    which = torch.randint(kinds, (rows, height, width), generator=draw)
-    which[torch.rand(which.shape, generator=draw) < 0.6] = 0
-    cells = tiles[which].permute(0, 3, 1, 4, 2, 5)
-    return cells.reshape(rows, channels, 8 * height, 8 * width)
 
 
 def test_images_keep_their_contrast_through_the_convolutions_of_a_new_encoder():
@@ -93,15 +82,15 @@ def test_patches_of_a_ragged_image_are_padded_with_black():
     torch.testing.assert_close(encoder(ragged), encoder(padded))
 
 
-@pytest.mark.parametrize("dtype", [torch.int64, torch.int16, torch.bool])
-def test_whole_numbers_that_are_no_bytes_are_no_images(dtype):
-    policy = make_policy(Shapes((3, 48, 48), vocabulary_size=9), "paper", seed=0)
-    with pytest.raises(UserError, match=r"bytes \(uint8\) or floats within 0..1"):
-        policy(pixels=torch.zeros(2, 3, 48, 48, dtype=dtype), instruction=torch.ones(2, 16))
-
-
-@pytest.mark.parametrize("scale", [-1.0, 255.0, float("nan")])
-def test_floats_beyond_0_and_1_are_no_images(scale):
+@pytest.mark.parametrize(
+    ("dtype", "value", "said"),
+    [
+        *[(t, 0, r"are bytes \(uint8\) or floats") for t in (torch.int64, torch.int16, torch.bool)],
+        *[(torch.float32, v, r"within 0\.\.1, got .*: divide") for v in (-1.0, 255.0, torch.nan)],
+    ],
+)
+def test_other_numbers_are_no_images(dtype, value, said):
     policy = make_policy(Shapes((3, 16, 16), vocabulary_size=9), "paper", seed=0)
-    with pytest.raises(UserError, match=r"floats are within 0..1, got .*: divide 0..255 by 255"):
-        policy(pixels=scale * torch.ones(2, 3, 16, 16), instruction=torch.ones(2, 16).long())
+    pixels = torch.full((2, 3, 16, 16), value, dtype=dtype)
+    with pytest.raises(UserError, match=said):
+        policy(pixels=pixels, instruction=torch.ones(2, 16).long())

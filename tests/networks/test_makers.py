@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import NetworkConfig, Shapes
-from networks.conftest import MAKERS, OUTPUTS, inputs, nested_keys
+from networks.conftest import MAKERS, OUTPUTS, inputs, nested_keys, tiled
 
 SIZES = [
     Shapes((3, 96, 96), 40, tile_size=16),
@@ -86,11 +86,24 @@ def test_the_paper_has_dropout_but_no_critic_does(kind, shapes):
     assert repeats == (kind == "value")
 
 
-def test_floats_in_zero_to_one_are_bytes_over_255(kind, preset, shapes):
+@pytest.mark.parametrize("alike", [True, False])
+def test_floats_are_bytes_over_255_of_which_those_that_repeat_are_read_once(
+    kind, preset, shapes, alike
+):
     module = MAKERS[kind](shapes, preset, seed=0)
-    data = inputs(shapes, [3])
+    data = inputs(shapes, [40 if alike else 3])
+    if alike:
+        data["pixels"], data["initial_pixels"], data["next", "pixels"] = tiled(120).split(40)
     floats = data.apply(lambda x: x / 255 if x.dtype == torch.uint8 else x)
-    torch.testing.assert_close(run(kind, module, data)[0], run(kind, module, floats)[0])
+    found = [outputs_and_gradients(module, kind, each) for each in (data, floats)]
+    torch.testing.assert_close(*found, atol=1e-3, rtol=1e-3)
+
+
+def outputs_and_gradients(module, kind, data):
+    module.zero_grad()
+    out, _ = run(kind, module, data)
+    (out * torch.linspace(-1, 1, out.numel()).view_as(out)).sum().backward()
+    return [out.detach(), *(parameter.grad.clone() for parameter in module.parameters())]
 
 
 def test_keys_can_be_nested(kind, shapes):

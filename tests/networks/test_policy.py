@@ -30,16 +30,6 @@ def rollout(shapes: Shapes, policy, batch=(2, 5)) -> TensorDict:
     return data.detach()
 
 
-def test_actions_are_indices_with_their_log_probability(pair, shapes):
-    policy, _ = pair
-    out = policy(inputs(shapes, [64]).exclude("action"))
-    assert out["action"].shape == (64,)
-    assert out["action"].dtype == torch.int64
-    expected = out["logits"].log_softmax(-1).gather(-1, out["action"].unsqueeze(-1)).squeeze(-1)
-    torch.testing.assert_close(out["action_log_prob"], expected)
-    assert policy.spec["action"].n == 6
-
-
 def test_sampling_is_the_default_and_determinism_an_option(shapes):
     data = inputs(shapes, [1]).exclude("action").expand(300)
     sampled = make_policy(shapes, seed=0)(data.clone())

@@ -79,10 +79,3 @@ def test_a_classifier_of_strong_copies_what_words_mean(shapes, make, monkeypatch
     fresh = make(shapes, seed=1).encode_instruction(tokens)
     own = words[:, : -modifier.shape[1]]
     torch.testing.assert_close(own, fresh[:, : own.shape[1]])
-
-
-def test_roles_of_words_are_copied_where_asked(shapes):
-    policy = make_policy(shapes, seed=0)
-    classifier = make_instruction_classifier(shapes, init_from=policy, roles=True, seed=1)
-    own, theirs = classifier.module.words, instructed_network(policy).trunk.words
-    assert all(map(torch.equal, own.state_dict().values(), theirs.state_dict().values()))

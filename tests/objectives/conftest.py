@@ -17,6 +17,7 @@ from ifo_grounding.objectives import (
     InverseLoss,
     RewardLoss,
 )
+from networks.conftest import inputs
 
 SHAPES = Shapes((3, 24, 24), 14, instruction_length=4, tile_size=8)
 POOL = torch.arange(1, 13).unsqueeze(1) * torch.tensor([1, 1, 0, 0])
@@ -46,22 +47,9 @@ def make_loss(kind: str, preset: str = "paper", make_options=None, **options):
 
 
 def batch(size=(12,), seed: int = 0) -> TensorDict:
-    source = torch.Generator().manual_seed(seed)
-
-    def frames():
-        return torch.randint(256, (*size, 3, 24, 24), dtype=torch.uint8, generator=source)
-
-    return TensorDict(
-        {
-            "pixels": frames(),
-            "initial_pixels": frames(),
-            "next": {"pixels": frames()},
-            "instruction": POOL[torch.randint(len(POOL), size, generator=source)],
-            "action": torch.randint(6, size, generator=source),
-            "final": torch.rand(*size, 1, generator=source) < 0.4,
-        },
-        list(size),
-    )
+    data, source = inputs(SHAPES, [*size], seed), torch.Generator().manual_seed(seed)
+    data["instruction"] = POOL[torch.randint(len(POOL), size, generator=source)]
+    return data.set("final", torch.rand(*size, 1, generator=source) < 0.4)
 
 
 def seeded(loss, *args, **kwargs):

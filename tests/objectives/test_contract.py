@@ -62,6 +62,13 @@ def test_gradients_reach_every_parameter(kind, preset):
         assert parameter.grad.abs().sum() > 0, name
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_it_may_be_of_another_precision(kind, preset, dtype):
+    loss = make_loss(kind, preset).to(dtype)
+    total(loss(batch())).backward()
+    assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())
+
+
 def test_state_round_trip(kind):
     first = make_loss(kind)
     second = make_loss(kind, make_options={"seed": 1})

@@ -85,12 +85,3 @@ def test_an_untrained_classifier_does_not_remove_nearly_all():
     negatives = NegativeInstructions(POOL, None)
     negatives.watch(torch.zeros(100), torch.zeros(100))
     assert negatives.removal_rate == MOST_REMOVED
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
-def test_the_estimate_may_be_of_any_precision(dtype):
-    """As that of a loss is, whose precision is another."""
-    estimate = MixtureEstimate().to(dtype)
-    for _ in range(8):
-        estimate.add(torch.randn(512) + 3, torch.randn(4096))
-    assert estimate.share() == pytest.approx(0.0, abs=0.05)

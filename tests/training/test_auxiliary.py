@@ -17,36 +17,23 @@ from ifo_grounding.training import (
     HeldOutAccuracy,
     self_examine,
 )
-from training.tiny import (
-    POOL,
-    TEACH,
-    config,
-    kill_at,
-    labelled,
-    likes,
-    make_env,
-    make_networks,
-    prefer,
-    same,
-    simulator,
-    weights,
-)
+from training import tiny
 
 
 def reward_loss(seed=0):
-    return RewardLoss(make_reward_model(simulator(1), features=16, seed=seed))
+    return RewardLoss(make_reward_model(tiny.simulator(1), features=16, seed=seed))
 
 
 def test_auxiliary_imitation_keeps_what_the_demonstrations_show():
     """Demonstrations that always take action 3 hold against a reward model that likes action 1."""
     demos, shares = TensorDictReplayBuffer(storage=LazyTensorStorage(12)), {}
-    shown = {keys.PIXELS: simulator(12).reset()[keys.PIXELS], keys.INSTRUCTION: POOL}
+    shown = {keys.PIXELS: tiny.simulator(12).reset()[keys.PIXELS], keys.INSTRUCTION: tiny.POOL}
     demos.extend(TensorDict({**shown, keys.ACTION: torch.full((12,), 3)}, [12]))
     for weight in (0.0, 10.0):
-        policy, value = make_networks()
+        policy, value = tiny.make_networks()
         imitation = AuxiliaryImitation(ImitationLoss(policy), demos, weight, 32) if weight else None
-        taught = config(iterations=3, **TEACH)
-        history = self_examine(make_env(), policy, value, taught, seed=0, imitation=imitation)
+        taught = tiny.config(iterations=3, **tiny.TEACH)
+        history = self_examine(tiny.make_env(), policy, value, taught, seed=0, imitation=imitation)
         assert ("loss_imitation" in history[-1]) == bool(weight)
         action = policy(TensorDict(shown, [12]))[keys.ACTION]
         shares[weight] = float((action == 3).float().mean())
@@ -70,33 +57,34 @@ def test_adversarial_updates_tell_actions_apart_and_go_on_from_a_checkpoint(tmp_
     options = {"seed": 0, "checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
 
     def examine(updates, **options):
-        env, chosen = make_env(updates.loss.network, num_envs=8), config()
-        return self_examine(env, *make_networks(), chosen, adversarial=updates, **options)
+        env, chosen = tiny.make_env(updates.loss.network, num_envs=8), tiny.config()
+        return self_examine(env, *tiny.make_networks(), chosen, adversarial=updates, **options)
 
     whole, resumed = adversarial(), adversarial(seed=1)
     first, last = examine(whole, seed=0)
     assert last["reward/loss_reward"] < first["reward/loss_reward"]
     assert last["reward/positive_probability"] > last["reward/negative_probability"]
     with pytest.raises(KeyboardInterrupt):
-        examine(adversarial(), log=kill_at(2), **options)
+        examine(adversarial(), log=tiny.kill_at(2), **options)
     examine(resumed, **options)
-    assert same(weights(resumed.loss), weights(whole.loss))
+    assert tiny.same(tiny.weights(resumed.loss), tiny.weights(whole.loss))
 
 
 def test_with_adversarial_updates_the_most_accurate_policy_is_kept():
     """The learned returns would keep the last policy, which a misleading reward has changed."""
-    policy, value = make_networks()
-    prefer(policy, 2)
-    before = weights(policy)
-    misled = config(select_every=1, **TEACH)
-    options = {"seed": 0, "adversarial": AdversarialUpdates(reward_loss(), labelled(2), 1, 0.0)}
-    accuracy = HeldOutAccuracy(policy, labelled(2))
-    history = self_examine(make_env(), policy, value, misled, held_out=accuracy, **options)
+    policy, value = tiny.make_networks()
+    tiny.prefer(policy, 2)
+    before = tiny.weights(policy)
+    misled = tiny.config(select_every=1, **tiny.TEACH)
+    updates = AdversarialUpdates(reward_loss(), tiny.labelled(2), 1, 0.0)
+    options = {"seed": 0, "adversarial": updates}
+    accuracy = HeldOutAccuracy(policy, tiny.labelled(2))
+    history = self_examine(tiny.make_env(), policy, value, misled, held_out=accuracy, **options)
     assert [metrics.get("selected") for metrics in history] == [0, 0]
     assert history[-1]["held_out_accuracy"] < 0.5
     assert "selection_return" not in history[-1]
-    assert same(weights(policy), before)
+    assert tiny.same(tiny.weights(policy), before)
     with pytest.raises(UserError, match="give held_out="):
-        self_examine(make_env(likes(1)), policy, value, misled, **options)
+        self_examine(tiny.make_env(tiny.likes(1)), policy, value, misled, **options)
     with pytest.raises(UserError, match="give held_out="):
-        BestCheckpoint(make_env(), policy, seed=0, by_accuracy=True)
+        BestCheckpoint(tiny.make_env(), policy, seed=0, by_accuracy=True)

@@ -31,36 +31,14 @@ def test_a_checkpoint_of_something_else_says_of_what(path, layer):
     assert "\n" not in str(error.value)
 
 
-def test_a_flipped_bit_is_noticed_or_changes_nothing(path, layer):
-    """What is between the entries of the archive is read by nobody."""
-    whole, said = path.read_bytes(), []
-    for place in range(0, len(whole), 13):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
-        other = torch.nn.Linear(3, 2)
-        try:
-            Checkpoint(path, SETTINGS, layer=other).load()
-        except UserError as error:
-            said.append(str(error))
-        else:
-            assert torch.equal(other.weight, layer.weight) and torch.equal(other.bias, layer.bias)
-    assert len(said) > 30
-    assert all("run.pt" in line and "\n" not in line for line in said)
-
-
-@pytest.mark.parametrize("length", [0, 200])
-def test_a_damaged_checkpoint_is_named(path, layer, length):
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(UserError, match=r"run\.pt is damaged.*: delete it to start over"):
-        Checkpoint(path, SETTINGS, layer=layer).load()
-
-
 def test_a_foreign_file_is_refused_and_runs_no_code(tmp_path, layer):
     class Trap:
         def __reduce__(self):
             return (open, (str(tmp_path / "sprung"), "w"))
 
     path = tmp_path / "run.pt"
-    for content, error in (({"weights": torch.zeros(1)}, "no checkpoint of"), (Trap(), "damaged")):
+    damaged = r"run\.pt is damaged.*: delete it to start over"
+    for content, error in (({"weights": torch.zeros(1)}, "no checkpoint of"), (Trap(), damaged)):
         torch.save(content, path)
         with pytest.raises(UserError, match=error):
             Checkpoint(path, SETTINGS, layer=layer).load()

@@ -14,26 +14,13 @@ from ifo_grounding.training import (
     FitConfig,
     HeldOutAccuracy,
     fit,
-    select_pairs,
     self_examine,
 )
 from ifo_grounding.training.selection import learned_returns
 from ifo_grounding.transforms import LearnedReward, StartingPairs
-from training.tiny import (
-    POOL,
-    TEACH,
-    accepts_all,
-    config,
-    labelled,
-    likes,
-    make_env,
-    make_networks,
-    make_policy,
-    prefer,
-    same,
-    simulator,
-    weights,
-)
+from training import tiny
+
+SHORT = {"select_episodes": 16, "max_steps": 3}
 
 
 class Square(nn.Module):
@@ -101,8 +88,8 @@ def test_each_demonstration_counts_once():
     policy = Sometimes()
     policy.wrong = 3  # both transitions of the first, one of four of the second
     lengths = (3, 5, 2)
-    assert HeldOutAccuracy(policy, labelled(1, lengths)).measure().tolist() == [0.0, 0.75, 1.0]
-    assert HeldOutAccuracy(policy, labelled(0, lengths)).measure().tolist() == [1.0, 0.25, 0.0]
+    assert HeldOutAccuracy(policy, tiny.labelled(1, lengths)).measure().tolist() == [0.0, 0.75, 1.0]
+    assert HeldOutAccuracy(policy, tiny.labelled(0, lengths)).measure().tolist() == [1.0, 0.25, 0.0]
     for make in (EarlyStopping, HeldOutAccuracy):
         with pytest.raises(UserError, match="no held-out samples"):
             make(policy, TensorDictReplayBuffer(storage=LazyTensorStorage(4)))
@@ -110,7 +97,7 @@ def test_each_demonstration_counts_once():
 
 def test_only_what_is_clearly_below_the_first_accuracy_is_worse():
     policy = Sometimes()
-    accuracy, worse = HeldOutAccuracy(policy, labelled(1)), []
+    accuracy, worse = HeldOutAccuracy(policy, tiny.labelled(1)), []
     for policy.wrong in (20, 21, 60, 0):
         worse.append(accuracy.compare()[1])
     assert worse == [False, False, True, False]
@@ -118,16 +105,16 @@ def test_only_what_is_clearly_below_the_first_accuracy_is_worse():
 
 
 def test_what_is_compared_with_goes_on_from_a_checkpoint():
-    policy = make_policy()
-    prefer(policy, 1, 9.0)
+    policy = tiny.make_policy()
+    tiny.prefer(policy, 1, 9.0)
     options = {"seed": 0, "episodes": 8, "max_steps": 2}
-    best, again = [
-        BestCheckpoint(make_env(), policy, held_out=HeldOutAccuracy(policy, labelled(1)), **options)
-        for _ in range(2)
-    ]
+    best, again = (
+        BestCheckpoint(tiny.make_env(), policy, held_out=accuracy, **options)
+        for accuracy in [HeldOutAccuracy(policy, tiny.labelled(1)) for _ in range(2)]
+    )
     assert best.measure()["held_out_accuracy"] == 1.0
     again.load_state_dict(best.state_dict())
-    prefer(policy, 2, 99.0)
+    tiny.prefer(policy, 2, 99.0)
     assert again.measure()["selected"] == 0.0
     again.restore()
     assert again.measure()["held_out_accuracy"] == 1.0
@@ -135,16 +122,16 @@ def test_what_is_compared_with_goes_on_from_a_checkpoint():
 
 @pytest.mark.parametrize("held_out", [False, True])
 def test_a_policy_that_a_misleading_reward_has_changed_is_not_kept(held_out):
-    policy, value = make_networks()
-    prefer(policy, 2)
-    before = weights(policy)
-    accuracy = HeldOutAccuracy(policy, labelled(2)) if held_out else None
-    misled = config(iterations=4, select_every=2, select_episodes=16, max_steps=3, **TEACH)
-    history = self_examine(make_env(likes(1)), policy, value, misled, seed=0, held_out=accuracy)
+    policy, value = tiny.make_networks()
+    tiny.prefer(policy, 2)
+    before = tiny.weights(policy)
+    accuracy = HeldOutAccuracy(policy, tiny.labelled(2)) if held_out else None
+    misled = tiny.config(iterations=4, select_every=2, **SHORT, **tiny.TEACH)
+    history = self_examine(tiny.make_env(), policy, value, misled, seed=0, held_out=accuracy)
     measured = [metrics for metrics in history if "selected" in metrics]
     assert measured[-1]["selection_return"] > 2
     assert measured[0]["selected"] == (not held_out)
-    assert same(weights(policy), before) == held_out
+    assert tiny.same(tiny.weights(policy), before) == held_out
     if held_out:
         assert measured[-1]["held_out_accuracy"] < 0.5
 
@@ -163,7 +150,7 @@ class Always(nn.Module):
 
 
 def test_each_start_counts_one_episode():
-    env = make_env(likes(1), num_envs=8)
+    env = tiny.make_env(tiny.likes(1), num_envs=8)
     like, dislike = 1 / (1 + torch.e**-4), 1 / (1 + torch.e**4)
     returns = learned_returns(env, Always(1, steps=3), episodes=8, max_steps=40)
     assert returns.tolist() == pytest.approx([3 * like + dislike] * 8, abs=1e-5)
@@ -173,7 +160,7 @@ def test_each_start_counts_one_episode():
 
 @pytest.fixture(scope="module")
 def env():
-    return make_env(num_envs=1)
+    return tiny.make_env(num_envs=1)
 
 
 def layer_and_best(env, margin):
@@ -218,13 +205,12 @@ def test_under_the_one_standard_error_rule_what_is_not_clearly_worse_is_kept(env
 
 
 def test_stored_pairs_are_measured_from_the_same_first_starts():
-    pairs = select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
-    starts, paid = StartingPairs(pairs), LearnedReward(likes(1))
-    env = TransformedEnv(simulator(8), Compose(starts, paid))
-    policy, value = make_networks()
-    other = TransformedEnv(simulator(8), Compose(copy.deepcopy(starts), copy.deepcopy(paid)))
+    starts, paid = StartingPairs(tiny.pairs()), LearnedReward(tiny.likes(1))
+    env = TransformedEnv(tiny.simulator(8), Compose(starts, paid))
+    policy, value = tiny.make_networks()
+    other = TransformedEnv(tiny.simulator(8), Compose(copy.deepcopy(starts), copy.deepcopy(paid)))
     first = BestCheckpoint(other, policy, seed=0, episodes=16, max_steps=3).measure()
-    frozen = config(iterations=3, value_warmup=2, select_every=1, select_episodes=16, max_steps=3)
+    frozen = tiny.config(iterations=3, value_warmup=2, select_every=1, **SHORT)
     history = self_examine(env, policy, value, frozen, seed=0)
     returns = {metrics["selection_return"] for metrics in history[:2]}
     assert returns == {first["selection_return"]}
@@ -233,7 +219,7 @@ def test_stored_pairs_are_measured_from_the_same_first_starts():
 def test_measuring_leaves_the_training_as_it_is():
     runs = []
     for every in (0, 1):
-        chosen = config(select_every=every, select_episodes=16, max_steps=2)
-        history = self_examine(make_env(), *make_networks(), chosen, seed=0)
+        chosen = tiny.config(select_every=every, select_episodes=16, max_steps=2)
+        history = self_examine(tiny.make_env(), *tiny.make_networks(), chosen, seed=0)
         runs.append([metrics["learned_reward"] for metrics in history])
     assert runs[0] == runs[1]

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.data import (
+    LazyTensorStorage,
+    RandomSampler,
+    SamplerWithoutReplacement,
+    TensorDictReplayBuffer,
+)
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import Shapes, make_instruction_classifier, make_policy
@@ -57,27 +62,22 @@ def test_fit_is_a_function_of_its_seed(buffer):
     assert losses[0] == losses[1] != losses[2]
 
 
-def test_a_run_goes_on_within_a_round_of_all_samples(buffer, tmp_path):
-    def learned(**options):
-        loss, sampler = imitation(), SamplerWithoutReplacement()
-        stored = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=sampler)
+@pytest.mark.parametrize("sampler", [RandomSampler, SamplerWithoutReplacement])
+def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path, sampler):
+    """Also within a round of all samples, which has eight steps."""
+
+    def learn(loss, **options):
+        stored = TensorDictReplayBuffer(storage=LazyTensorStorage(256), sampler=sampler())
         stored.extend(buffer[:256])
-        fit(loss, stored, FitConfig(steps=12, batch_size=32, iteration=3), seed=0, **options)
-        return weights(loss)
+        return fit(loss, stored, FitConfig(steps=12, batch_size=32, iteration=3), seed=0, **options)
 
-    learned(checkpoint=tmp_path / "fit.pt", until=6)
-    assert same(learned(checkpoint=tmp_path / "fit.pt"), learned())
-
-
-def test_a_killed_run_continues_to_the_same_weights(buffer, tmp_path):
-    config = FitConfig(steps=12, batch_size=32, iteration=3)
     whole = imitation(0.25)
-    expected = fit(whole, buffer, config, seed=0)
-    options = {"seed": 0, "checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
+    expected = learn(whole)
+    options = {"checkpoint": tmp_path / "run.pt", "checkpoint_seconds": 0.0}
     with pytest.raises(KeyboardInterrupt):
-        fit(imitation(0.25), buffer, config, log=kill_at(9), **options)
+        learn(imitation(0.25), log=kill_at(9), **options)
     resumed, steps = imitation(0.25), []
-    history = fit(resumed, buffer, config, log=lambda _, step: steps.append(step), **options)
+    history = learn(resumed, log=lambda _, step: steps.append(step), **options)
     assert steps == [9, 12]  # the iteration that was cut is done again
     for row in (*history, *expected):
         row.pop("samples_per_second")

@@ -11,7 +11,7 @@ from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, labelled_buffer
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.tasks import grammar
-from ifo_grounding.training import SelfExaminationConfig
+from ifo_grounding.training import SelfExaminationConfig, select_pairs
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 
 POOL = grammar("move").tokens
@@ -87,10 +87,17 @@ def simulator(num_envs=16, **kwargs):
     return PickAndPlaceEnv("move", num_envs, seed=0, instructed=False, **kwargs)
 
 
+def sampler():
+    return InstructionSampler(accepts_all(), POOL)
+
+
 def make_env(reward_model=None, num_envs=16):
-    sampler = InstructionSampler(accepts_all(), POOL)
     reward = LearnedReward(reward_model or likes(1))
-    return TransformedEnv(simulator(num_envs), Compose(sampler, reward))
+    return TransformedEnv(simulator(num_envs), Compose(sampler(), reward))
+
+
+def pairs():
+    return select_pairs(simulator(8), accepts_all(), POOL, 24, seed=0)
 
 
 def config(**kwargs):

@@ -20,8 +20,8 @@ def pixels(*numbers):
     return shade.view(-1, 1, 1, 1).expand(-1, 3, 8, 8)
 
 
-def choose(numbers, model=None, **options):
-    return PoolScorer(model or classifier(), POOL).choose(pixels(*numbers), **options)
+def choose(numbers, model=None, pool=POOL, **options):
+    return PoolScorer(model or classifier(), pool).choose(pixels(*numbers), **options)
 
 
 @pytest.mark.parametrize("network", [Suitability(), Suitability().eval().forward])
@@ -129,6 +129,9 @@ def test_candidates_are_distinct_and_uniform():
     assert draw_candidates(2, 3, 6, None).sort(1).values.tolist() == [[0, 1, 2], [0, 1, 2]]
 
 
+BOTH = ["pixels", "instruction"]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -136,40 +139,17 @@ def test_candidates_are_distinct_and_uniform():
         ({"threshold": -0.1}, "threshold must be within 0..1"),
         ({"candidates": 0}, "candidates must be at least 1"),
         ({"choose": "worst"}, "unknown choose 'worst'"),
+        ({"pool": torch.zeros(0, 4).long()}, "pool is empty"),
+        ({"pool": torch.zeros(3, 4)}, "pool must be token ids"),
+        ({"pool": torch.zeros(4).long()}, "pool must be token ids"),
+        ({"pool": None}, "pool must be token ids"),
+        ({"model": Suitability()}, "expected a TensorDictModule"),
+        ({"model": TensorDictModule(lambda a: a, BOTH[:1], ["x"])}, "pixels and an instruction"),
+        ({"model": TensorDictModule(lambda *a: a, BOTH, ["x", "y"])}, "be named 'suitability'"),
+        ({"model": classifier(network=lambda a, b: a.new_zeros(len(a), 2))}, r"1\], got \[4, 2\]"),
+        ({"model": constant(torch.nan)}, "not a number"),
     ],
 )
-def test_impossible_options(options, message):
+def test_what_does_not_fit_is_refused(options, message):
     with pytest.raises(UserError, match=message):
         choose([0], **options)
-
-
-@pytest.mark.parametrize(
-    ("pool", "message"),
-    [
-        (torch.zeros(0, 4).long(), "pool is empty"),
-        (torch.zeros(3, 4), "pool must be token ids"),
-        (torch.zeros(4).long(), "pool must be token ids"),
-        (None, "pool must be token ids"),
-    ],
-)
-def test_impossible_pools(pool, message):
-    with pytest.raises(UserError, match=message):
-        PoolScorer(classifier(), pool)
-
-
-BOTH = ["pixels", "instruction"]
-
-
-@pytest.mark.parametrize(
-    ("model", "message"),
-    [
-        (Suitability(), "expected a TensorDictModule"),
-        (TensorDictModule(lambda a: a, ["pixels"], ["x"]), "reads pixels and an instruction"),
-        (TensorDictModule(lambda a, b: (a, b), BOTH, ["x", "y"]), "must be named 'suitability'"),
-        (classifier(network=lambda a, b: a.new_zeros(len(a), 2)), r"\[4, 1\], got \[4, 2\]"),
-        (constant(torch.nan), "not a number"),
-    ],
-)
-def test_impossible_models(model, message):
-    with pytest.raises(UserError, match=message):
-        choose([0], model)

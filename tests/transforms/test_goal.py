@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import check_env_specs
 
 from ifo_grounding.errors import UserError
@@ -73,15 +72,6 @@ def test_on_arrival_the_episode_ends():
     assert torch.equal(after["terminated"][..., 0], reached)
     assert (after["done"] >= after["terminated"]).all()
     assert torch.allclose(after["learned_reward"][..., 0], reached * SURE)
-
-
-def test_a_replay_buffer_pays_what_the_environment_paid():
-    rollout = make(goal()).rollout(30, expert, break_when_any_done=False).reshape(-1)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=64, transform=goal())
-    buffer.extend(rollout.exclude(("next", "learned_reward")))
-    sample = buffer.sample()
-    stops = (sample["action"] == STOP).unsqueeze(-1)
-    assert torch.allclose(sample["next", "learned_reward"], stops * SURE)
 
 
 def test_only_stops_are_scored():

@@ -34,20 +34,6 @@ def test_unsuitable_states_are_drawn_again_for_those_rows_only():
     assert torch.equal(shown(tensordict["pixels"]), world.number)
 
 
-@pytest.mark.parametrize("rows", [(0,), (1, 3), (0, 1, 2, 3)])
-def test_partial_resets_touch_their_rows_only(rows):
-    env = make((4,), StepCounter())
-    tensordict = env.rollout(3, policy=go_up, break_when_any_done=False)[:, -1]["next"]
-    mask = torch.zeros(4, 1, dtype=torch.bool)
-    mask[list(rows)] = True
-    after = env.reset(tensordict.exclude("reward").clone().set("_reset", mask))
-    others = [row for row in range(4) if row not in rows]
-    for key in ("pixels", "instruction", "step_count"):
-        assert torch.equal(after[key][others], tensordict[key][others]), key
-    assert (after["step_count"][list(rows)] == 0).all()
-    assert suits(after[list(rows)]).all()
-
-
 def go_up(tensordict):
     return tensordict.set("action", torch.zeros(tensordict.batch_size, dtype=torch.int64))
 
@@ -96,16 +82,6 @@ def test_stats_count_and_start_anew():
     assert 10 <= stats["candidates_scored"] <= 4 * stats["states_drawn"]
     assert stats["mean_score"] == pytest.approx(torch.tensor(3.0).sigmoid().item())
     assert set(env.transform.stats().values()) == {0.0}
-
-
-def test_mode_of_the_classifier_is_left_alone():
-    model = classifier().train()
-    env = make(model=model).eval()
-    env.reset()
-    assert model.training and model.module.dropout.training
-    model.eval()
-    env.train().reset()
-    assert not model.training
 
 
 def test_environments_that_show_their_state_or_instruct_are_refused():
@@ -158,8 +134,6 @@ def test_nothing_suitable_is_one_clear_line():
 def test_impossible_options_are_refused_at_once():
     with pytest.raises(UserError, match="max_tries must be at least 1"):
         make(max_tries=0)
-    with pytest.raises(UserError, match=r"threshold must be within 0\.\.1"):
-        make(threshold=2.0)
 
 
 def test_specs_are_those_of_an_instructed_environment():

@@ -63,27 +63,6 @@ def test_episodes_of_a_rollout_begin_with_pairs():
     assert len(counts) == 7 and max(counts.values()) - min(counts.values()) <= 1
 
 
-def test_partial_resets_touch_and_use_up_their_rows_only():
-    env = make((4,))
-    tensordict = env.reset()
-    used, scenes = env.transform.used, env.scene_numbers.clone()
-    mask = torch.tensor([[False], [True], [False], [False]])
-    after = env.reset(tensordict.clone().set("_reset", mask.clone()))
-    assert env.transform.used == used + 1
-    others = [0, 2, 3]
-    assert torch.equal(env.scene_numbers[others], scenes[others])
-    for key in ("pixels", "instruction"):
-        assert torch.equal(after[key][others], tensordict[key][others]), key
-    assert after["instruction"][1, 1] == env.scene_numbers[1] != scenes[1]
-
-
-def test_state_dict_resumes_the_order():
-    env, other = make((4,)), make((4,), seed=5)
-    starts(env, 3)
-    other.load_state_dict(env.state_dict())
-    assert starts(env, 10) == starts(other, 10)
-
-
 def test_other_scenes_than_the_stored_ones_are_noticed():
     pairs = make_pairs()
     world = CounterWorld((7,), seed=1)
