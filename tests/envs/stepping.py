@@ -1,7 +1,5 @@
 """What the tests of the pick-and-place environment share."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 

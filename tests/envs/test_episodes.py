@@ -1,7 +1,5 @@
 """Episodes of the pick-and-place environment: steps, resets, own sentences, given states."""
 
-from __future__ import annotations
-
 import contextlib
 import pickle
 from functools import partial
@@ -12,8 +10,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from tensordict import TensorDict
 
-from envs.dial import MARKS, Dial
-from envs.stepping import choose, everything, scenes
+from envs.dial import dials
+from envs.stepping import choose, everything
 from ifo_grounding.data import babyai
 from ifo_grounding.envs import PickAndPlaceEnv, from_gymnasium
 from ifo_grounding.errors import UserError
@@ -81,29 +79,6 @@ def test_success_counts_when_time_runs_out(late):
     assert (after["reward"].squeeze(-1)[idles] == 1 - late).all()
 
 
-def test_partial_resets_touch_only_their_rows():
-    env = PickAndPlaceEnv("pick", 6, seed=0, expose_state=True)
-    td = env.reset()
-    for _ in range(5):
-        td = choose(env, td, torch.randint(5, (6,))).exclude("reward")
-    steps = env._simulator.steps.clone()
-    mask = torch.tensor([0, 1, 0, 0, 1, 1]).bool()
-    before = td.clone()
-    given = td.copy().set("_reset", mask.unsqueeze(-1))
-    after = env.reset(given, set_state=False)
-    assert after is given  # as EnvBase does
-    assert torch.equal(td["pixels"], before["pixels"])  # the images given stay as they were
-    for key, value in everything(after.exclude("_reset")).items():
-        assert torch.equal(value[~mask], before[key][~mask])
-    changed = (after["pixels"] != before["pixels"]).flatten(1).any(1)
-    assert torch.equal(changed, mask)
-    assert torch.equal(env._simulator.steps, torch.where(mask, 0, steps))
-    assert env.scene_numbers.tolist() == [0, 6, 2, 3, 7, 8]
-    # They can name their scenes, too.
-    env.reset(after.update({"scene": scenes(*range(50, 56))["scene"], "_reset": ~mask[:, None]}))
-    assert env.scene_numbers.tolist() == [50, 6, 52, 53, 7, 8]
-
-
 @pytest.mark.parametrize("foreign", [False, True])
 @pytest.mark.parametrize("instructed", [False, True])
 def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
@@ -163,11 +138,6 @@ def reachable(start) -> list:
     return [*found.values()]
 
 
-def dials(**options):
-    words = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS])
-    return from_gymnasium(Dial, vocabulary=words, image="view", instruction="task", **options)
-
-
 def rooms(**options):
     pytest.importorskip("minigrid")
     words = Vocabulary(["go", "to", "the", "red", "ball"])
@@ -197,15 +167,6 @@ def test_a_reset_takes_one_s_own_sentence():
     amid = env.reset().update(own(env, "move to the red circle").exclude("scene"))
     with pytest.raises(UserError, match=r"give it to reset\(\), in a TensorDict of 'scene'"):
         env.rollout(2, auto_reset=False, tensordict=amid)
-
-
-def test_without_instructions_there_is_no_goal_and_no_reward():
-    env = PickAndPlaceEnv("move", 64, seed=0, instructed=False)
-    rollout = env.rollout(60, break_when_any_done=False)
-    assert "instruction" not in rollout
-    assert "instruction" not in rollout["next"]
-    assert rollout["next", "terminated"].any()
-    assert not rollout["next", "reward"].any()
 
 
 @pytest.mark.parametrize("make", [partial(PickAndPlaceEnv, "pick"), dials, rooms])

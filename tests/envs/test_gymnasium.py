@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import sys
 
 import gymnasium
@@ -164,8 +162,6 @@ def test_torchrl_wraps_one_world_and_many():
 @pytest.mark.parametrize(
     ("kind", "wrong", "said"),
     [
-        (PickAndPlaceGymEnv, {"task": "fly"}, "unknown task 'fly'"),
-        (PickAndPlaceGymEnv, {"tile_size": 9}, "unknown tile size 9: choose one of 8, 16, 32"),
         (PickAndPlaceGymEnv, {"render_mode": "ascii"}, "unknown render mode 'ascii'"),
         (PickAndPlaceVectorEnv, {"render_mode": "human"}, "unknown render mode 'human'"),
         (PickAndPlaceVectorEnv, {"num_envs": 0}, "num_envs must be at least 1"),

@@ -1,7 +1,5 @@
 """Many worlds of Gymnasium, moved by one batched simulator."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
@@ -117,31 +115,6 @@ def test_without_autoreset_the_caller_resets():
     assert np.array_equal(fresh["pixels"][[0, 2]], stream[[3, 4]])
     assert np.array_equal(fresh["instruction"][1], before["instruction"][1])
     assert not envs.step(np.array([UP, UP, UP]))[2].any()
-
-
-def test_infos_equal_those_of_gymnasium_s_own_vectorizer():
-    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
-        native = gymnasium.make_vec("ifo_grounding/Move-v0", 2, autoreset_mode=mode)
-        chosen = {"vector_kwargs": {"autoreset_mode": mode}}
-        loop = gymnasium.make_vec("ifo_grounding/Move-v0", 2, "sync", **chosen)
-        formats = []
-        for envs in (native, loop):
-            seen = [shape(envs.reset(seed=0)[1])]
-            for actions in ([STOP, UP], [UP, UP], [UP, STOP]):
-                result = envs.step(np.array(actions))
-                seen.append((shape(result[4]), *(part.dtype for part in result[1:4])))
-            formats.append(seen)
-        assert formats[0] == formats[1]
-
-
-def shape(infos: dict) -> dict:
-    """Keys, types and masks of infos; their scenes differ."""
-    return {
-        key: shape(value)
-        if isinstance(value, dict)
-        else (value.dtype, value.tolist() if key.startswith("_") else None)
-        for key, value in infos.items()
-    }
 
 
 def test_observations_and_infos_are_new_at_every_call():

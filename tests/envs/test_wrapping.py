@@ -11,29 +11,11 @@ from gymnasium.wrappers import FrameStackObservation, TimeLimit
 from tensordict import TensorDict
 from torchrl.envs import check_env_specs
 
-from envs.dial import MARKS, PRESS, Dial
-from ifo_grounding.data import collect_transitions
+from envs.dial import DIAL, MARKS, PRESS, WORDS, Dial, dials
 from ifo_grounding.envs import from_gymnasium, wrapping
 from ifo_grounding.errors import UserError
-from ifo_grounding.evaluation import record_episodes, success_rate
 from ifo_grounding.networks import make_policy
 from ifo_grounding.tasks import VOCABULARY, Vocabulary
-
-WORDS = Vocabulary.from_sentences([f"turn the dial to {mark}" for mark in MARKS], length=6)
-DIAL = {"vocabulary": WORDS, "image": "view", "instruction": "task"}
-
-
-def dials(num_envs=3, **options):
-    return from_gymnasium(Dial, num_envs=num_envs, **{"seed": 0, **DIAL, **options})
-
-
-@pytest.mark.parametrize("instructed", [True, False])
-def test_specs_hold(instructed):
-    env = dials(instructed=instructed)
-    check_env_specs(env)
-    assert ("instruction" in env.observation_spec) == instructed
-    assert env.observation_spec["pixels"].shape == (3, 3, 20, 28)
-    assert env.action_spec.space.n == 3
 
 
 def test_an_id_is_made_with_its_options():
@@ -86,33 +68,13 @@ def test_scenes_have_numbers_and_streams_do_not_meet():
     assert not torch.equal(trained, evaluated)
 
 
-def test_partial_resets_touch_only_their_rows():
-    env = dials(4)
-    td = env.reset()
-    td = env.step_mdp(env.step(td.set("action", torch.tensor([0, 1, 0, 1]))))
-    mask = torch.tensor([[False], [True], [False], [True]])
-    after = env.reset(td.clone().set("_reset", mask))
-    kept = ~mask.squeeze(-1)
-    assert torch.equal(after["pixels"][kept], td["pixels"][kept])
-    assert torch.equal(after["instruction"][kept], td["instruction"][kept])
-    assert env.scene_numbers.tolist() == [0, 4, 2, 5]
-    again = env.step(after.set("action", torch.full((4,), PRESS)))
-    assert torch.equal(again["next", "pixels"], after["pixels"])  # pressing moves nothing
-
-
-def test_a_learner_sees_neither_reward_nor_the_world_s_own_goal():
-    rollout = dials(8, instructed=False, seed=1).rollout(60, break_when_any_done=False)
-    assert not rollout["next", "reward"].any()
-    assert not rollout["next", "terminated"].any()
-    assert rollout["next", "truncated"].any()
-
-
 @pytest.mark.parametrize(("stop", "actions", "action"), [("add", 4, 3), (PRESS, 3, PRESS)])
 @pytest.mark.parametrize("instructed", [True, False])
 def test_a_policy_can_say_that_it_is_done(stop, actions, action, instructed):
     env = dials(2, stop=stop, instructed=instructed)
     check_env_specs(env)
     assert env.action_spec.space.n == actions
+    assert env.stop_action == action and dials(2).stop_action is None
     td = env.reset()
     after = env.step(td.set("action", torch.tensor([0, action])))["next"]
     assert after["terminated"].flatten().tolist() == [False, True]
@@ -131,20 +93,6 @@ def test_processes_show_what_one_process_shows(monkeypatch):
     apart.close()
     for key in ("pixels", "instruction", "action", ("next", "reward")):
         assert torch.equal(apart.seen[key], together.seen[key])
-
-
-def test_episodes_are_recorded_as_they_are_counted():
-    half = lambda td: knows(td).set("action", torch.where(wanted(td) < 3, td["action"], PRESS))  # noqa: E731
-    result = success_rate(half, dials(7), episodes=14)
-    assert 0 < result.rate.rate < 1
-    episodes = record_episodes(half, dials(3), [11, 4, 12])
-    assert [e.success for e in episodes] == result.outcomes[[11, 4, 12]].tolist()
-    assert [len(e.actions) for e in episodes] == result.lengths[[11, 4, 12]].tolist()
-    for episode in episodes:
-        assert len(episode.frames) == len(episode.actions) + 1
-        assert episode.actions[-1] == PRESS and episode.sentence.startswith("turn the dial to")
-    with pytest.raises(UserError, match="3 rows for 2 scenes"):
-        record_episodes(half, dials(3), [0, 1])
 
 
 def test_words_that_nobody_taught_can_be_left_out():
@@ -179,9 +127,7 @@ SAME, GREY = Dial(), np.zeros((20, 28), np.uint8)
         (Dial, {"image": None}, "bytes"),
         (Dial, {"instruction": "mission"}, "no instruction 'mission'.*wanted"),
         (Dial, {"vocabulary": Vocabulary(["turn", "the"])}, "unknown word 'dial'"),
-        (Dial, {"num_envs": 0}, "num_envs"),
         (Dial, {"stop": 3}, "stop must be an action 0..2 or 'add', got 3"),
-        (Dial, {"stop": 2.0}, "stop must be a whole number, got 2.0"),
         (Dial, {"stop": "press"}, r"stop must be an action 0\.\.2 or 'add', got 'press'"),
         (Dial, {"vocabulary": ["turn"]}, "vocabulary is a Vocabulary.*got list"),
         (Dial(), {}, "its class, got Dial"),
@@ -198,8 +144,6 @@ SAME, GREY = Dial(), np.zeros((20, 28), np.uint8)
         (like(reset=lambda self, seed: Dial.reset(self)[0]), {}, "Like.reset must return .* dict"),
         (like(reset=lambda self: Dial.reset(self)), {}, "Like.reset takes no seed"),
         (Dial, {"instructed": "no"}, "instructed 'no': choose one of True, False"),
-        (Dial, {"skip_unknown": "no"}, "skip_unknown 'no'"),
-        (Dial, {"processes": "no"}, "processes 'no'"),
     ],
 )
 def test_worlds_that_do_not_fit_are_refused(make, options, said):
@@ -262,26 +206,6 @@ def test_an_image_keeps_its_size():
         env.reset()
 
 
-@pytest.mark.parametrize("stop", [None, PRESS])
-@pytest.mark.parametrize("action", [-1, 3])
-def test_actions_that_the_world_has_not_are_refused(stop, action):
-    env = dials(2, stop=stop)
-    with pytest.raises(UserError, match=r"actions are 0\.\.2 here.*another world"):
-        env.step(env.reset().set("action", torch.tensor([0, action])))
-
-
-@pytest.mark.parametrize(("stop", "named"), [(None, None), (PRESS, PRESS), ("add", 3)])
-def test_it_says_which_action_is_the_stop(stop, named):
-    env = dials(20, stop=stop, instructed=False)
-    assert env.stop_action == named
-    buffer, report = collect_transitions(env, 300)
-    sample = buffer[:]
-    unchanged = (sample["pixels"] == sample["next", "pixels"]).flatten(1).all(1)
-    assert set(sample["action"][unchanged].tolist()) == ({named} if stop is not None else set())
-    # Pressing shows nothing: without a stop it cannot be told from a bump.
-    assert (report.kept[PRESS] > 0) == (named == PRESS)
-
-
 @pytest.mark.parametrize(
     ("shape", "channels"),
     [
@@ -299,13 +223,6 @@ def test_gymnasium_s_stacked_frames_are_channels():
     seen = env.rollout(3, make_policy(env))["next"]
     assert torch.equal(seen["pixels"][0, 1:, :3], seen["pixels"][0, :-1, 3:])
     assert WORDS.decode(seen["instruction"][0, :1])[0].startswith("turn the dial")
-
-
-def test_episodes_that_begin_in_inference_mode_go_on_outside():
-    with torch.inference_mode():
-        env = dials(3)
-        env.rollout(5, break_when_any_done=False)
-    assert env.rollout(20, break_when_any_done=False).shape == (3, 20)
 
 
 def test_a_world_that_is_refused_is_closed():

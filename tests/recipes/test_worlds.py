@@ -1,9 +1,11 @@
 """Every recipe on every world: BabyAI, any of Gymnasium, and a class of one's own."""
 
+import shutil
 import sys
 
 import pytest
 
+from envs import dial as dial_module
 from ifo_grounding import networks
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.errors import UserError
@@ -11,81 +13,12 @@ from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
 
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
-DIAL = '''
-"""A world outside the package: a dial with six marks on an image of 20 x 28 pixels."""
-import gymnasium
-import numpy as np
-
-from ifo_grounding.envs import from_gymnasium
-from ifo_grounding.worlds import World
-
-MARKS = ("one", "two", "three", "four", "five", "six")
-
-
-class Dial(gymnasium.Env):
-    observation_space = gymnasium.spaces.Dict({})
-    action_space = gymnasium.spaces.Discrete(3)
-
-    def __init__(self, marks=6):
-        self.marks = marks
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.at, self.wanted = self.np_random.choice(self.marks, 2, replace=False)
-        self.steps = 0
-        return self._look(), {}
-
-    def step(self, action):
-        self.steps += 1
-        self.at = int(np.clip(self.at + (-1, 1, 0)[action], 0, self.marks - 1))
-        pressed = action == 2
-        return self._look(), float(pressed and self.at == self.wanted), pressed, self.steps > 12, {}
-
-    def _look(self):
-        view = np.full((20, 28, 3), 30, np.uint8)
-        view[4:16, 2 + 4 * self.at : 5 + 4 * self.at] = (220, 180, 60)
-        return {"view": view, "task": f"turn the dial to {MARKS[self.wanted]}"}
-
-
-class DialWorld(World):
-    def __init__(self, marks=6):
-        self.marks, self.actions, self.stop_action = marks, ("left", "right", "press"), 2
-
-    def simulator(self, num_envs, *, seed, device="cpu"):
-        return self._dials(num_envs, seed, "training", False, device)
-
-    def instructed(self, num_envs, *, seed, stream, split="all", waits=False, device="cpu"):
-        return self._dials(num_envs, seed, stream, True, device)
-
-    def _dials(self, num_envs, seed, stream, instructed, device):
-        return from_gymnasium(
-            lambda: Dial(self.marks), vocabulary=self.vocabulary, num_envs=num_envs, image="view",
-            instruction="task", instructed=instructed, stop=2, seed=seed, stream=stream,
-            device=device,
-        )
-
-
-def demonstrations(n):
-    from ifo_grounding.data import Demonstrations
-
-    shown, said = [], []
-    for seed in range(n):
-        world = Dial()
-        seen, _ = world.reset(seed=seed)
-        frames = [seen["view"]]
-        while world.at != world.wanted:
-            seen, *_ = world.step(int(world.at < world.wanted))
-            frames.append(seen["view"])
-        shown.append(np.stack(frames).transpose(0, 3, 1, 2))
-        said.append(seen["task"])
-    return Demonstrations.from_arrays(shown, said)
-'''
 
 
 @pytest.fixture
 def dial(tmp_path, monkeypatch):
     """A module ``own_dial`` outside of the package, and a folder of its demonstrations."""
-    (tmp_path / "own_dial.py").write_text(DIAL)
+    shutil.copy(dial_module.__file__, tmp_path / "own_dial.py")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     import own_dial
@@ -98,7 +31,7 @@ def dial(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "world",
     [
-        ["world=own", "world._target_=own_dial.DialWorld", "+world.marks=6"],
+        ["world=own", "world._target_=own_dial.DialWorld", "+world.max_steps=9"],
         [
             *("world=gymnasium", "world.factory=own_dial.Dial", "world.image=view"),
             *("world.instruction=task", "world.stop=2", "world.names=[left,right,press]"),
