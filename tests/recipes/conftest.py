@@ -12,7 +12,7 @@ TINY = (
     *(f"{stage}.batch_size=32" for stage in ("inverse", "imitate", "instruction", "goal")),
     *("self_examine.num_envs=8", "self_examine.steps=10", "self_examine.minibatch=40"),
     *("self_examine.select_episodes=8", "evaluate.episodes=20", "evaluate.states=20"),
-    "evaluate.audit_episodes=10",
+    *("evaluate.audit_episodes=10", "evaluate.max_steps=8", "self_examine.max_steps=8"),
 )
 """Options of a run of both phases in seconds."""
 

@@ -1,18 +1,17 @@
 """A recipe killed at any moment continues to the same result."""
 
-import os
+import multiprocessing
 import shutil
 import signal
-import subprocess
-import sys
 import time
 
 import torch
 from safetensors.torch import load_file
 
 from ifo_grounding.files import read_json
-from recipes.conftest import TINY, make_stages
+from recipes.conftest import make_stages
 
+FORK = multiprocessing.get_context("fork")
 OPTIONS = ("imitate.steps=60", "imitate.iteration=2", "checkpoint_seconds=0")
 
 
@@ -22,7 +21,7 @@ def last_saved(run) -> int:
     return max((path.stat().st_mtime_ns for path in found), default=0)
 
 
-def test_sigkill_changes_nothing(options, recipes, tmp_path):
+def test_sigkill_changes_nothing(options, tmp_path):
     from imitate import imitate
 
     make_stages(options(*OPTIONS, run="prepared"), until="label")
@@ -30,20 +29,17 @@ def test_sigkill_changes_nothing(options, recipes, tmp_path):
     for run in (whole, killed):  # this process holds the lock of what it has opened
         shutil.copytree(tmp_path / "prepared", run)
     imitate(options(*OPTIONS, run="whole"))
-    command = [sys.executable, str(recipes / "imitate.py"), *TINY, *OPTIONS, f"run={killed}"]
     kills = 0
     for pause in (0.02, 0.2):
-        process = subprocess.Popen(
-            command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL
-        )
+        child = FORK.Process(target=imitate, args=(options(*OPTIONS),))
+        child.start()
         deadline, before = time.monotonic() + 120, last_saved(killed)
-        while process.poll() is None and time.monotonic() < deadline:
-            if last_saved(killed) != before:
-                time.sleep(pause)
-                break
+        while child.is_alive() and time.monotonic() < deadline and last_saved(killed) == before:
             time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-        kills += process.wait() == -signal.SIGKILL
+        time.sleep(pause)
+        child.kill()
+        child.join()
+        kills += child.exitcode == -signal.SIGKILL
     assert kills
     imitate(options(*OPTIONS))
     name = "policy-phase1.safetensors"

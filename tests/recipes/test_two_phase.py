@@ -1,7 +1,6 @@
 """Both phases through the recipes: what they make, what is made once, what is refused."""
 
 import re
-import shutil
 import types
 
 import pytest
@@ -13,7 +12,6 @@ from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.report import results_table
-from ifo_grounding.report.results import by_scene
 from pretended_gpu import pretended_gpu
 from recipes.conftest import make_stages
 
@@ -191,24 +189,6 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
     assert fresh_states(given, 301) is None
     states = fresh_states(given, 300)
     assert len(states) == len(states.flatten(1).unique(dim=0)) == 301
-
-
-@pytest.mark.parametrize("mode", ["greedy", "sampled"])
-def test_changed_scenes_are_shown_of_what_was_measured(options, mode, phase_1, monkeypatch):
-    # Actions that were drawn are not drawn again: what they solved may fail in the picture.
-    from _shared import open_run
-
-    import report
-
-    monkeypatch.setattr(report, "step_by_step", lambda *_: {})  # slow to draw
-    given = options()
-    run = open_run(given)
-    shutil.copy(run / "policy-phase1.safetensors", run / "policy-phase2.safetensors")
-    outcomes = {"phase1": torch.zeros(20).bool(), "phase2": torch.ones(20).bool()}
-    results = {phase: {"mode": mode, **by_scene(which)} for phase, which in outcomes.items()}
-    found = report.episode_pictures(run, given, results)
-    assert "Episodes of phase 2" in found
-    assert ("Before and after self-examination" in found) == (mode == "greedy")
 
 
 def test_what_is_measured_otherwise_is_measured_anew(options, capsys, phase_1):
