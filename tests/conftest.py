@@ -1,7 +1,5 @@
 """Every test starts from the same seeds, on one thread, away from the user's own folders."""
 
-from __future__ import annotations
-
 import os
 import random
 

@@ -1,7 +1,5 @@
 """Everything takes a device: where there is no GPU, one is pretended."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import nn
@@ -9,20 +7,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, TransformedEnv
 
-from ifo_grounding.data import (
-    Demonstrations,
-    collect_transitions,
-    first_frame_buffer,
-    goal_buffer,
-    record_demonstrations,
-)
+from ifo_grounding import data, networks
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.networks import (
-    make_goal_classifier,
-    make_instruction_classifier,
-    make_policy,
-    make_reward_model,
-)
 from ifo_grounding.objectives import GoalLoss, InstructionLoss
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 from pretended_gpu import pretended_gpu
@@ -52,27 +38,27 @@ def test_what_is_pretended_refuses_what_a_gpu_refuses(tmp_path):
 
 
 def test_transforms_collect_on_a_gpu():
-    demos = record_demonstrations("pick", 20, seed=0)
+    demos = data.record_demonstrations("pick", 20, seed=0)
     with pretended_gpu():
         env = PickAndPlaceEnv("pick", num_envs=8, seed=0, device="cuda", instructed=False)
-        classifier = make_instruction_classifier(demos, device="cuda", seed=0)
-        model = make_reward_model(demos, device="cuda", seed=0)
+        classifier = networks.make_instruction_classifier(demos, device="cuda", seed=0)
+        model = networks.make_reward_model(demos, device="cuda", seed=0)
         chooser = InstructionSampler(classifier, demos.pool(), threshold=0.0)
         env = TransformedEnv(env, Compose(chooser, LearnedReward(model)))
-        policy = make_policy(demos, device="cuda", seed=0)
+        policy = networks.make_policy(demos, device="cuda", seed=0)
         for batch in Collector(env, policy, frames_per_batch=64, total_frames=64, device="cuda"):
             assert batch["next", "learned_reward"].is_cuda
             assert batch["pixels"].is_cuda
         plain = PickAndPlaceEnv("pick", num_envs=8, seed=0, device="cuda", instructed=False)
-        buffer, _ = collect_transitions(plain, 50, seed=0)
+        buffer, _ = data.collect_transitions(plain, 50, seed=0)
         assert len(buffer) > 0
 
 
 def test_frames_of_a_gpu_become_demonstrations():
-    demos = record_demonstrations("move", 3, seed=0)
+    demos = data.record_demonstrations("move", 3, seed=0)
     with pretended_gpu():
         frames = [demos[number]["pixels"].to("cuda") for number in range(3)]
-        made = Demonstrations.from_arrays(frames, demos.sentences())
+        made = data.Demonstrations.from_arrays(frames, demos.sentences())
         assert torch.equal(made.frames(torch.arange(2)), frames[0][:2].cpu())
         which = torch.tensor([2, 0], device="cuda")
         assert torch.equal(made[which].first_frames()[0], frames[2][0].cpu())
@@ -82,19 +68,21 @@ def test_frames_of_a_gpu_become_demonstrations():
 @pytest.mark.parametrize("kind", ["instruction", "goal"])
 def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
     """There neither distinct instructions nor final frames are looked for."""
-    demos = record_demonstrations("move", 40, seed=0)
+    demos = data.record_demonstrations("move", 40, seed=0)
     pool = demos.pool()[:2]  # of two, the other one is drawn
     demos = demos[torch.nonzero((demos.tokens[:, None] == pool).all(-1).any(-1)).squeeze(1)]
 
     def losses(device):
         options = {"seed": 0, "device": device, "precision": "fp32"}
         if kind == "goal":
-            loss = GoalLoss(make_goal_classifier(demos, "paper", **options), pool, negatives=1)
-            batch = goal_buffer(demos)[:]
+            loss = GoalLoss(
+                networks.make_goal_classifier(demos, "paper", **options), pool, negatives=1
+            )
+            batch = data.goal_buffer(demos)[:]
         else:
-            network = make_instruction_classifier(demos, "paper", **options)
+            network = networks.make_instruction_classifier(demos, "paper", **options)
             loss = InstructionLoss(network, pool, unlabelled="mixture", near=0.5)
-            batch = first_frame_buffer(demos)[:]
+            batch = data.first_frame_buffer(demos)[:]
         out = loss.to(device).eval()(batch.to(device))
         return {name: float(value) for name, value in out.items()}
 

@@ -25,11 +25,6 @@ def test_rows_that_mirror_each_other_do_not_collide():
     assert distinct._hash(rows).unique().numel() == 4
 
 
-def test_no_rows():
-    rows, index = distinct_rows(torch.zeros(0, 5, dtype=torch.int64))
-    assert rows.shape == (0, 5) and index.shape == (0,)
-
-
 def test_what_a_vmap_with_random_numbers_asked_first_serves_all_others():
     distinct._factors.cache_clear()
     torch.vmap(lambda rows: rows + int(distinct._factors(3)[0]), randomness="different")(

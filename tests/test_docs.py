@@ -1,7 +1,5 @@
 """The documentation does what it says: its Python runs, its commands and options exist."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import runpy
@@ -13,16 +11,10 @@ import pytest
 import torch
 from torchrl.envs import Compose, TransformedEnv
 
-from ifo_grounding import objectives
+from ifo_grounding import networks, objectives
 from ifo_grounding.cli import recipe_names, recipes_folder, resolve
 from ifo_grounding.config import Options
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.networks import (
-    make_instruction_classifier,
-    make_policy,
-    make_reward_model,
-    make_value,
-)
 from ifo_grounding.options import MULTIRUN, field_docs, options_of, options_of_jobs
 from ifo_grounding.tasks import grammar
 from ifo_grounding.training import SelfExaminationConfig, self_examine
@@ -215,12 +207,12 @@ def test_every_metric_of_a_loss_is_documented():
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_metric_of_self_examination_is_documented(algorithm):
     base = PickAndPlaceEnv("move", num_envs=4, seed=0, instructed=False)
-    classifier = make_instruction_classifier(base, seed=0)
-    reward, policy = make_reward_model(base, seed=0), make_policy(base, seed=0)
+    classifier = networks.make_instruction_classifier(base, seed=0)
+    reward, policy = networks.make_reward_model(base, seed=0), networks.make_policy(base, seed=0)
     pool = grammar("move").tokens
     transforms = Compose(InstructionSampler(classifier, pool, threshold=0.0), LearnedReward(reward))
     config = SelfExaminationConfig(algorithm, iterations=1, steps=4, minibatch=8, value_warmup=0)
     env = TransformedEnv(base, transforms)
-    value = make_value(base, seed=0)
+    value = networks.make_value(base, seed=0)
     (metrics,) = self_examine(env, policy, value, config, seed=0)
     assert set(metrics) <= documented("phase2")

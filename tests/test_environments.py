@@ -1,7 +1,5 @@
 """Every dependency says which version is the oldest that works, so that it can be tried."""
 
-from __future__ import annotations
-
 import re
 
 from environments import requirements

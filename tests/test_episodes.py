@@ -1,7 +1,5 @@
 """The player: each row plays one episode, for any policy and any world."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import gymnasium

@@ -7,24 +7,11 @@ import make_results
 import make_speed
 import make_tables
 import pages
-import pytest
 
-from ifo_grounding.files import read_json, write_json
+from ifo_grounding.files import read_json
 from ifo_grounding.stats import wilson
 
 ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture
-def results(tmp_path, monkeypatch):
-    """An empty folder of results, which the scripts read instead of the committed one."""
-    monkeypatch.setattr(pages, "RESULTS", tmp_path)
-    caches = make_results.runs_of.cache_clear, make_tables.pieces.cache_clear
-    for clear in caches:
-        clear()
-    yield tmp_path
-    for clear in caches:
-        clear()
 
 
 def test_every_table_of_the_pages_is_what_the_scripts_write():
@@ -55,38 +42,6 @@ def test_every_result_says_where_it_comes_from():
 def test_a_page_keeps_what_is_not_its_table():
     text = "a\n<!-- x -->\nold\n<!-- /x -->\nb\n<!-- y -->\nkept\n<!-- /y -->\n<!-- x y -->"
     assert pages.renewed(text, {"x": "new"}) == text.replace("old", "new")
-
-
-def policy(bits):
-    return {"outcomes": bits, "rate": {"count": 8}}
-
-
-def piece(task, results, **options):
-    return {
-        "options": {"task": task, "variant": None, **options},
-        "results": results,
-        "seconds": 755.0,
-        "stages": {"imitate": 725.0, "imitate_truth": 30.0},
-    }
-
-
-def test_a_study_compares_policies_over_its_seeds(results):
-    solved = {"phase1": "f0", "phase2": "fc", "continued": "f8"}
-    measured = {name: policy(bits) for name, bits in solved.items()}
-    rates = {"rate": 0.9, "served": 0.5, "servable": 0.6}
-    measured["suitability"] = {name: {"rate": rate} for name, rate in rates.items()}
-    for seed in range(2):
-        run = piece("pick", measured, demonstrations={"n": 200})
-        write_json(results / "study" / f"{seed}.json", run)
-        measured.pop("continued", None)  # one seed has the control
-    row = make_results.study_rows()["pick", 200]
-    assert row["seeds"] == 2
-    assert row["phase 1"].startswith("50.0% [") and row["phase 2"].startswith("75.0% [")
-    assert row["gain, points"].startswith("+25.0 [")
-    assert row["over continued imitation"].startswith("+12.5 [")
-    assert row["over continued imitation"].endswith("] (seeds: 1)")
-    [row] = make_results.choice_rows(200)
-    assert list(row.values()) == ["pick", "90.0%", "50.0%", "60.0%"]
 
 
 def test_gains_of_the_paper_have_newcombes_interval():

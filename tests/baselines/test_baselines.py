@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from ifo_grounding import baselines
 from ifo_grounding.baselines import (
     AGILE,
     GAIL,
@@ -183,7 +182,3 @@ def test_updates_tell_demonstrations_from_the_policy(name, sources):
 def test_agile_needs_a_stop(sources):
     with pytest.raises(UserError, match="paid at the stop"):
         AGILE(sources["steps"], stop_action=None, **SMALL)
-
-
-def test_all_that_is_public_is_there():
-    assert all(hasattr(baselines, name) for name in baselines.__all__)

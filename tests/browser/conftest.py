@@ -1,7 +1,5 @@
 """What the tests of pages share: Chromium, the screens, and a tab that notes what a page does."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

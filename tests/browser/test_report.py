@@ -1,7 +1,5 @@
 """The report of a run, opened in headless Chromium as a reader would open it."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

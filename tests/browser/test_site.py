@@ -1,7 +1,5 @@
 """The documentation as a reader sees it: built, served and opened in headless Chromium."""
 
-from __future__ import annotations
-
 import functools
 import http.server
 import threading

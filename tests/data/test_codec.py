@@ -1,7 +1,5 @@
 """The frame codec gives back every pixel, whatever the frames."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -46,41 +44,6 @@ def test_frames_of_the_world_shrink_a_hundredfold(tile_size):
     assert codec.tile_size is not None
     assert torch.equal(codec.decode(codes), frames)
     assert codes.nbytes * 100 < frames.nbytes
-
-
-def test_batch_dimensions_are_kept():
-    frames = render(random_layout(Lots(0, torch.arange(12)))).view(3, 4, 3, 48, 48)
-    codec, codes = FrameCodec.compress(frames.flatten(0, 1), tile_size=8)
-    codes = codes.view(3, 4, 6, 6)
-    assert torch.equal(codec.decode(codes), frames)
-    assert torch.equal(codec.decode(codes[1, 2]), frames[1, 2])
-
-
-def test_a_long_stream_of_noise_is_given_up_on_the_way():
-    generator = torch.Generator().manual_seed(0)
-
-    def noise():
-        for _ in range(10):
-            yield torch.randint(256, (500, 1, 8, 8), dtype=torch.uint8, generator=generator)
-
-    codec, codes = FrameCodec.compress(noise())
-    generator.manual_seed(0)
-    assert codec.tile_size is None
-    assert torch.equal(codes, torch.cat(list(noise())))
-
-
-def test_codes_grow_with_the_dictionary():
-    def distinct(low, high):
-        number = torch.arange(low, high)
-        frames = torch.zeros(high - low, 1, 8, 64, dtype=torch.uint8)
-        frames[:, 0, 0, 0], frames[:, 0, 0, 1] = number % 256, number // 256
-        return frames
-
-    parts = [distinct(0, 200), distinct(200, 600)]
-    codec, codes = FrameCodec.compress(iter(parts), tile_size=8)
-    assert codes.dtype == torch.int16
-    assert len(codec.tiles) == 600
-    assert torch.equal(codec.decode(codes), torch.cat(parts))
 
 
 def test_codes_of_a_renderer_say_nothing_that_pixels_do_not():

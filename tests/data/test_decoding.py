@@ -1,7 +1,5 @@
 """Replay buffers that store codes and sample pixels."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -39,13 +37,3 @@ def test_entries_can_be_rows_of_shared_frames():
     assert torch.equal(sample["seen"], FRAMES[:-1])
     assert torch.equal(sample["next", "seen"], FRAMES[1:])
     assert torch.equal(sample["name"], names[:-1])
-
-
-def test_samples_follow_the_tables_to_their_device():
-    lookups = Lookup(CODES, ["pixels"]), Lookup(torch.arange(40).float(), ["name"])
-    transform = Compose(*lookups, FrameDecoder(CODEC, ["pixels"])).to("meta")
-    entries = {"pixels": torch.arange(4), "name": torch.arange(4)}
-    sample = transform(TensorDict(entries, [4], device="cpu"))
-    assert sample["pixels"].device.type == sample["name"].device.type == "meta"
-    assert sample["pixels"].shape == (4, 3, 48, 48)
-    assert sample["name"].dtype == torch.float32

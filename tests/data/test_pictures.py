@@ -201,7 +201,6 @@ NOISE = np.random.default_rng(0).integers(256, size=(16, 24, 3), dtype=np.uint8)
     [
         ("episodes.jsonl", None, "jsonl does not exist: write one"),
         ("episodes.jsonl", b"\n", "lists no episode"),
-        ("episodes.jsonl", b'["a"]', "line 1: a line is a JSON object"),
         ("episodes.jsonl", b"[" * 100_000, "line 1: a line is a JSON object"),
         ("episodes.jsonl", "{é}".encode("latin-1"), r"jsonl cannot be read .*: save it as UTF-8"),
         ("episodes.jsonl", line("a") + b"\n" + line("a"), "lists episode 'a' twice"),
@@ -215,7 +214,6 @@ NOISE = np.random.default_rng(0).integers(256, size=(16, 24, 3), dtype=np.uint8)
         ("a/1.png", png(NOISE[:8, :8]), r"'a': 1\.png has 8x8 pixels, the first frame has 24x16"),
         ("a/1.png", png(NOISE)[:700], r"'a': 1\.png cannot be read \((Trunc|image file is trunc)"),
         ("a/1.png", png(NOISE[..., 0].astype(np.uint16)), r"1\.png .* mode 'I\S*: save 8 bits"),
-        ("a/1.png", b"no picture", r"episode 'a': 1\.png cannot be read"),
     ],
 )
 def test_what_is_wrong_is_said_with_the_name_of_the_episode(name, content, said, tmp_path):
@@ -256,14 +254,6 @@ def test_a_video_may_have_a_title_that_is_no_text(tmp_path):
     path = make_video(tmp_path / "a.mkv", frames=2, title="abc")
     path.write_bytes(path.read_bytes().replace(b"abc", b"a\xffc"))
     assert len(list(read_video(path))) == 2
-
-
-def test_a_recording_that_was_cut_stays_open(tmp_path):
-    write(tmp_path, "a", "b")
-    listed = line("a", truncated=True) + b"\n" + line("b", truncated=False)
-    (tmp_path / "episodes.jsonl").write_bytes(listed)
-    assert load_pictures(tmp_path).lengths.tolist() == [2, 3]
-    assert load_pictures(tmp_path, close=False).lengths.tolist() == [2, 2]
 
 
 def test_a_video_may_hold_frames_that_are_not_shown(tmp_path):

@@ -1,7 +1,5 @@
 """Recorded demonstrations show an expert at work, and the truth is kept apart."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -9,7 +7,6 @@ from ifo_grounding.data import Demonstrations, Truth, record_demonstrations, rec
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks import TASKS, SceneOptions, SceneStream, achieved, grammar, verdict
-from ifo_grounding.tasks.grammar import in_split
 from ifo_grounding.world import Layout, render, step
 
 
@@ -60,25 +57,11 @@ def test_streams_and_environments_of_the_same_seed_differ():
     assert len(firsts.unique(dim=0)) == 200
 
 
-@pytest.mark.parametrize("split", ["train", "zero-shot"])
-def test_splits_hold_their_own_instructions(split):
-    demos = record_demonstrations("pick-udlr", 50, split=split, holdout="pairs-2")
-    goals = grammar("pick-udlr").parse_tokens(demos.instructions)
-    assert in_split(goals, split, "pairs-2").all()
-
-
 @pytest.mark.parametrize(("tile_size", "size"), [(16, 6), (32, 4), (8, 10)])
 def test_other_sizes(tile_size, size):
     demos = record_demonstrations("move", 20, tile_size=tile_size, layout=Layout(size=size))
     scenes = scenes_of("move", 20, layout=Layout(size=size))
     assert torch.equal(demos.first_frames(), render(scenes.state, tile_size))
-
-
-def test_codes_are_small_and_say_nothing_more():
-    demos = record_demonstrations("pick", 300)
-    assert demos.n_frames * 3 * 48 * 48 > 30 * demos.nbytes
-    assert torch.equal(demos.codes.unique().long(), torch.arange(len(demos.codec.tiles)))
-    assert record_demonstrations("move", 300).codes.dtype == torch.uint8
 
 
 def test_truth_has_a_folder_of_its_own(tmp_path):
@@ -104,15 +87,8 @@ def test_threads_are_left_as_they_were():
         torch.set_num_threads(1)
 
 
-@pytest.mark.parametrize(
-    ("task", "n", "options", "said"),
-    [
-        ("fly", 3, {}, "unknown task 'fly': choose one of 'move'"),
-        ("move", 3, {"tile_size": 9}, "unknown tile size 9"),
-        ("move", 0, {}, "number of demonstrations must be at least 1, got 0"),
-        ("move", 3, {"split": "most"}, "unknown split 'most'"),
-    ],
-)
-def test_bad_input_is_refused(task, n, options, said):
-    with pytest.raises(UserError, match=said):
-        record_demonstrations(task, n, **options)
+def test_bad_input_is_refused():
+    with pytest.raises(UserError, match="number of demonstrations must be at least 1, got 0"):
+        record_demonstrations("move", 0)
+    with pytest.raises(UserError, match="unknown task 'fly': choose one of 'move'"):
+        record_demonstrations("fly", 3)

@@ -1,7 +1,5 @@
 """Random transitions: what is taken, kept and stored."""
 
-from __future__ import annotations
-
 import warnings
 from functools import partial
 
@@ -125,8 +123,6 @@ def test_bad_input_is_refused():
     env = make_env()
     with pytest.raises(UserError, match="n must be at least 1"):
         collect_transitions(env, 0)
-    with pytest.raises(UserError, match=r"stop_probability must be within 0\.\.1, got 2"):
-        collect_transitions(env, 10, stop_probability=2)
     with pytest.raises(UserError, match=r"stop_action must be 0\.\.5, got 6"):
         collect_transitions(env, 10, stop_action=6)
     env.action_spec = OneHot(6, shape=(16, 6))

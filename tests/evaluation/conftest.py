@@ -1,7 +1,5 @@
 """Policies that know the truth, to measure the measuring."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDictBase
@@ -15,10 +13,8 @@ class Expert:
 
     def __init__(self, task: str, seed: int = 0, stream: str = "evaluation") -> None:
         self.scenes = SceneStream(SceneOptions(task, stream=stream), seed)
-        self.rows_asked = 0
 
     def __call__(self, td: TensorDictBase) -> TensorDictBase:
-        self.rows_asked += len(td)
         state = WorldState(**dict(td["state"].items()), batch_size=td.batch_size)
         wanted = self.scenes.scenes(td["scene"].squeeze(-1)).wanted
         return td.set("action", expert.act(state, wanted))

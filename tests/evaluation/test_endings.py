@@ -72,16 +72,6 @@ def drop_elsewhere(scene, goal):
     return [*way(start, item), P, *way(item, empty), P, S]
 
 
-def go_to_another(scene, goal):
-    """Stand beside another object as one should beside the right one, if the grid has the cell."""
-    cell = int(other_cell(scene))
-    row, column = divmod(cell, 6)
-    row, column = row + (-1, 0, 1, 0)[goal.side], column + (0, 1, 0, -1)[goal.side]
-    if goal.has_side and 0 <= row < 6 and 0 <= column < 6:
-        cell = 6 * row + column
-    return [*way(scene.state.arm, cell), S]
-
-
 def endings(task, rule, **options):
     return episode_endings(Scripted(task, rule), task, episodes=EPISODES, **options)
 
@@ -100,13 +90,6 @@ def test_what_a_carrying_episode_did_instead(task):
     assert endings(task, stop).counts["nothing done"] == EPISODES
     assert endings(task, carry_another).counts["wrong object"] == EPISODES
     assert endings(task, drop_elsewhere).counts["wrong place"] == EPISODES
-
-
-def test_what_a_walking_episode_did_instead():
-    assert endings("move", go_to_another).counts["wrong object"] == EPISODES
-    beside = endings("move-udlr", go_to_another).counts
-    assert beside["wrong object"] > EPISODES / 2
-    assert endings("move-udlr", stop).counts["wrong place"] > EPISODES / 2
 
 
 def test_scenes_and_successes_are_those_of_success_rate():

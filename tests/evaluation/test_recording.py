@@ -1,7 +1,5 @@
 """Recorded episodes are those that the success rate counts."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Audits of rewards whose quality is known."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -11,7 +9,6 @@ from tensordict.nn import TensorDictModule
 from ifo_grounding.data import record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import return_audit, reward_audit
-from ifo_grounding.networks import make_reward_model
 from ifo_grounding.transforms import GoalReward, LearnedReward
 
 
@@ -49,30 +46,6 @@ def test_a_model_that_knows_only_the_stop(recorded):
     assert audit.auc.value == pytest.approx(by_hand)
     assert (audit.first.successes, audit.first.count) == (40, m)
     assert json.loads(json.dumps(audit.as_dict(), allow_nan=False))["first"]["successes"] == 40
-
-
-def test_a_model_that_knows_the_expert(recorded):
-    demos, truth = recorded
-    pictures = [picture.numpy().tobytes() for picture in demos.frames(demos.locate()[1])]
-    taken = dict(zip(pictures, truth.actions.tolist(), strict=True))
-
-    def right(pixels, action):
-        known = torch.tensor([taken[picture.numpy().tobytes()] for picture in pixels])
-        return (known == action).float().unsqueeze(-1)
-
-    # A frame before the stop equals no other frame here, so that pictures tell the action.
-    model = TensorDictModule(right, ["pixels", "action"], ["action_score"])
-    audit = reward_audit(model, demos, truth)
-    assert audit.auc.value == 1.0 and audit.first.rate == 1.0
-
-
-def test_an_untrained_model_is_no_better_than_chance_and_keeps_its_mode(recorded):
-    demos, truth = recorded
-    model = make_reward_model(demos, "paper", seed=0).train()
-    audit = reward_audit(model, demos, truth, transitions=100)
-    assert model.training and audit.first.count == 100
-    assert 0.2 < audit.auc.value < 0.8
-    assert reward_audit(model, demos, truth, transitions=100) == audit
 
 
 def test_what_does_not_fit_the_demonstrations_is_refused(recorded):

@@ -18,7 +18,6 @@ from ifo_grounding.data._episodes import read_table
 from ifo_grounding.data._images import stack_images
 from ifo_grounding.data.lerobot import load_lerobot, save_lerobot
 from ifo_grounding.errors import UserError
-from ifo_grounding.files import read_json
 from ifo_grounding.networks import Shapes, from_pretrained, make_policy, save_pretrained
 from ifo_grounding.tasks import VOCABULARY
 from ifo_grounding.training.checkpoint import FORMAT, Checkpoint
@@ -176,12 +175,6 @@ def test_no_changed_byte_of_a_png_changes_a_picture():
         changed = content[:at] + bytes([old ^ 64]) + content[at + 1 :]
         with contextlib.suppress(UserError):
             assert (stack_images([("a", changed)])[0].transpose(1, 2, 0) == frame).all(), at
-
-
-def test_a_pipe_in_place_of_json_does_not_hang(tmp_path):
-    os.mkfifo(tmp_path / "a.json")
-    with pytest.raises(UserError, match=r"a\.json cannot be read .*no regular file"):
-        read_json(tmp_path / "a.json")
 
 
 def test_an_error_is_one_line_whatever_it_cites():

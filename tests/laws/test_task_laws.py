@@ -1,7 +1,5 @@
 """What holds for every goal in every scene."""
 
-from __future__ import annotations
-
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """What holds in every world, whatever its size and contents."""
 
-from __future__ import annotations
-
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -6,12 +6,10 @@ from torch import Tensor
 
 from ifo_grounding.data import record_demonstrations
 from ifo_grounding.networks import (
-    PatchEncoder,
     Shapes,
     cells,
     make_goal_classifier,
     make_instruction_classifier,
-    patches,
     word_scoring,
 )
 from ifo_grounding.networks.cells import distinct_pairs
@@ -59,26 +57,6 @@ def test_scenes_are_read_by_kinds_of_cells_as_cell_by_cell(make, scenes, monkeyp
     monkeypatch.setattr(word_scoring, "group_cells", every_cell_for_itself)
     assert network.encode_scenes(*images).features.shape[-1] == 36
     assert_same(found, outputs_and_gradients(network, *images))
-
-
-@pytest.mark.parametrize("size", [(48, 48), (44, 50)])
-def test_patches_that_repeat_are_embedded_once(size, monkeypatch):
-    encoder = PatchEncoder(3, features=16, patch=8)
-    image = torch.zeros(4, 3, *size, dtype=torch.uint8)
-    image[:, :, 8:19, 10:30] = torch.arange(4, dtype=torch.uint8).view(4, 1, 1, 1) * 50
-    rows = []
-    encoder.embed.register_forward_hook(lambda _, args, out: rows.append(len(out)))
-    quick = encoder(image)
-    monkeypatch.setattr(patches, "is_plain", lambda image: False)
-    torch.testing.assert_close(quick, encoder(image))
-    assert rows[0] < rows[1] // 2
-
-
-def test_where_looking_up_would_not_pay():
-    noise = torch.randint(256, (4, 3, 48, 48), dtype=torch.uint8)
-    for image, patch in ((noise, 8), (torch.zeros(4, 3, 48, 48), 8), (torch.zeros_like(noise), 6)):
-        cells, where = patches.cells_of(image, patch)
-        assert len(cells) == where.numel() == 4 * (48 // patch) ** 2
 
 
 @pytest.mark.parametrize("room", [1 << 22, 0])  # pairs are marked in a table, or sorted

@@ -28,8 +28,9 @@ def test_images_keep_their_contrast_through_the_convolutions_of_a_new_encoder():
     assert 0.3 < sum(powers) / len(powers) < 1.5  # with PyTorch's own initial weights: 0.0005
 
 
-@pytest.mark.parametrize("layers", [2, 4])
-@pytest.mark.parametrize(("height", "width", "channels"), [(6, 6, 3), (5, 8, 1), (7, 7, 6)])
+@pytest.mark.parametrize(
+    ("layers", "height", "width", "channels"), [(2, 5, 8, 1), (4, 7, 7, 6), (4, 6, 6, 3)]
+)
 @pytest.mark.parametrize("zoom", [1, 3])  # enlarged, what the later layers look at repeats too
 def test_conv_encoder_computes_windows_that_repeat_once(layers, height, width, channels, zoom):
     torch.manual_seed(0)
@@ -94,3 +95,23 @@ def test_other_numbers_are_no_images(dtype, value, said):
     pixels = torch.full((2, 3, 16, 16), value, dtype=dtype)
     with pytest.raises(UserError, match=said):
         policy(pixels=pixels, instruction=torch.ones(2, 16).long())
+
+
+@pytest.mark.parametrize("make", [lambda: ConvEncoder(3, 8, 4), lambda: PatchEncoder(3, 8, 8)])
+def test_remembered_images_may_change_in_place_and_begin_anywhere_in_a_buffer(make):
+    encoder, images = make(), tiled(64)
+    before = encoder(images)
+    buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), images.flatten()])
+    torch.testing.assert_close(encoder(buffer[3:].view_as(images)), before)
+    images[3] = images[4]
+    changed = encoder(images)
+    torch.testing.assert_close(changed[3], before[4])
+    torch.testing.assert_close(changed[4:], before[4:])
+
+
+def test_what_inference_mode_finds_is_not_kept_for_training():
+    encoder, images = ConvEncoder(3, 8, 4), tiled(64)
+    with torch.inference_mode():
+        encoder(images)
+    encoder(images).sum().backward()  # tensors of inference mode cannot be saved for this
+    assert encoder.convolutions[0].weight.grad.abs().sum() > 0

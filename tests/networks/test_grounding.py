@@ -9,8 +9,8 @@ from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import episode_endings
 from ifo_grounding.modules import take_word_penalty
-from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy, make_value
-from ifo_grounding.networks.grounding import BEARINGS, MODIFIER, swap_words
+from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
+from ifo_grounding.networks.grounding import swap_words
 from ifo_grounding.networks.trunk import instructed_network
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
@@ -135,34 +135,6 @@ def test_pairs_that_no_demonstration_names_are_followed():
     scenes = {"episodes": 1000, "stream": "validation", "holdout": "validation-3"}
     found = episode_endings(loss.network, "move", split="zero-shot", **scenes)
     assert found.counts["success"] > 800
-
-
-def what_is_seen(trunk, image, words="red circle"):
-    """Return what the first silent head sees when it looks everywhere alike, not where it looks."""
-    with torch.no_grad():
-        trunk.attention.weight.zero_()
-        trunk.attention.bias.zero_()
-        both = trunk(image, VOCABULARY.encode([words]))[0]
-    maps, heads = 2 * trunk.words.relevance.out_channels, trunk.attention.out_features
-    turned = BEARINGS * 2 * (heads + maps) if trunk.around is not None else 0
-    each = (len(both) - turned - 2 * maps - MODIFIER) // heads
-    return both[2 : each - maps]
-
-
-@pytest.mark.parametrize("context", [0, 1, 2])
-def test_what_lies_around_is_seen(shapes, context):
-    policy = make_policy(shapes, "strong", seed=0, context=context)
-    trunk = instructed_network(policy).trunk
-    near, far = tiles("red circle", "blue triangle", arm=20), tiles("red circle", arm=20)
-    far[:, :, 32:40, 8:16] = near[:, :, :8, 8:16]  # the triangle, elsewhere
-    assert torch.allclose(what_is_seen(trunk, near), what_is_seen(trunk, far)) == (context == 0)
-    other_words = what_is_seen(trunk, near, "blue triangle")  # seen as maps of where they point
-    assert torch.equal(what_is_seen(trunk, near), other_words) == (context == 0)
-    critic = make_value(shapes, "strong", init_from=policy, context=context)
-    theirs = critic.module.trunk.state_dict()
-    assert all(torch.equal(theirs[name], weight) for name, weight in trunk.state_dict().items())
-    with pytest.raises(UserError, match="init_from does not fit"):
-        make_value(shapes, "strong", init_from=policy, context=context + 1)
 
 
 def test_padding_says_nothing(shapes, preset):

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ifo_grounding.networks import GatedAttention, GRUInstructionEncoder
+from ifo_grounding.networks import GatedAttention, GRUInstructionEncoder, ResidualBlock
 from ifo_grounding.tasks import VOCABULARY, grammar
 
 
@@ -40,3 +40,15 @@ def test_a_rate_changes_what_a_sentence_part_learns_not_what_it_computes():
         steps.append(float((before - after).abs().mean()))
     torch.testing.assert_close(*outputs)
     assert steps[1] / steps[0] == pytest.approx(0.1, rel=0.2)
+
+
+def test_a_residual_block_by_hand():
+    block = ResidualBlock(1)
+    with torch.no_grad():
+        block.mix.weight.fill_(2)
+        block.mix.bias.fill_(-1)
+        block.look.weight.fill_(1)
+        block.look.bias.fill_(0.25)
+    # mixed: 1, -1; ReLU: 1, 0; each cell sees both: 1
+    found = block(torch.tensor([[[[1.0, 0.0]]]]))
+    torch.testing.assert_close(found, torch.tensor([[[[1 + 1.25, 0 + 1.25]]]]))

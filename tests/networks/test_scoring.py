@@ -3,17 +3,12 @@
 import pytest
 import torch
 
+from ifo_grounding import networks
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import (
-    make_goal_classifier,
-    make_instruction_classifier,
-    make_reward_model,
-    scoring,
-)
 from networks.conftest import inputs
 
 
-@pytest.fixture(params=[make_instruction_classifier, make_goal_classifier])
+@pytest.fixture(params=[networks.make_instruction_classifier, networks.make_goal_classifier])
 def scorer(request, shapes, preset):
     return request.param(shapes, preset, seed=0)
 
@@ -24,7 +19,7 @@ def images(scorer, data):
 
 @pytest.mark.parametrize("at_once", [1, 4096])
 def test_the_halves_together_are_the_whole(scorer, shapes, at_once, monkeypatch):
-    monkeypatch.setattr(scoring, "PAIRS_AT_ONCE", at_once)
+    monkeypatch.setattr(networks.scoring, "PAIRS_AT_ONCE", at_once)
     scenes, pool = inputs(shapes, [4]), inputs(shapes, [3], seed=1)["instruction"]
     encoded = scorer.encode_scenes(*images(scorer, scenes))
     every = torch.arange(3).expand(4, -1)
@@ -48,7 +43,7 @@ def test_no_scenes_or_no_candidates_give_no_scores(scorer, shapes):
 
 
 def test_the_reward_model_scores_all_actions_as_it_scores_each(shapes, preset):
-    model = make_reward_model(shapes, preset, seed=0)
+    model = networks.make_reward_model(shapes, preset, seed=0)
     data = inputs(shapes, [2, 3])
     every = model.all_actions(data["pixels"], data["instruction"])
     assert every.shape == (2, 3, 6)

@@ -75,17 +75,6 @@ def test_ids_outside_the_vocabulary_are_refused(encoder):
             encoder(torch.tensor([[1, bad, 2]]))
 
 
-def test_each_distinct_instruction_is_encoded_once(encoder, monkeypatch):
-    rows = []
-    encode = encoder._encode_distinct
-    monkeypatch.setattr(
-        encoder, "_encode_distinct", lambda tokens: rows.append(len(tokens)) or encode(tokens)
-    )
-    silent = torch.zeros(2, 16, dtype=torch.int64)
-    found = encoder(torch.cat([sentences(12)[torch.randint(12, (200,))], silent]))
-    assert rows[0] <= 13 and not found[-2:].any()
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_sentences_that_begin_or_end_alike_are_read_once_with_the_same_result(task, pooling):
     torch.manual_seed(0)

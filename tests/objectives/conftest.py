@@ -2,14 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ifo_grounding.networks import (
-    Shapes,
-    make_goal_classifier,
-    make_instruction_classifier,
-    make_inverse,
-    make_policy,
-    make_reward_model,
-)
+from ifo_grounding import networks
 from ifo_grounding.objectives import (
     GoalLoss,
     ImitationLoss,
@@ -19,14 +12,14 @@ from ifo_grounding.objectives import (
 )
 from networks.conftest import inputs
 
-SHAPES = Shapes((3, 24, 24), 14, instruction_length=4, tile_size=8)
+SHAPES = networks.Shapes((3, 24, 24), 14, instruction_length=4, tile_size=8)
 POOL = torch.arange(1, 13).unsqueeze(1) * torch.tensor([1, 1, 0, 0])
 LOSSES = {
-    "inverse": (make_inverse, InverseLoss, {}),
-    "imitation": (make_policy, ImitationLoss, {}),
-    "instruction": (make_instruction_classifier, InstructionLoss, {"pool": POOL}),
-    "reward": (make_reward_model, RewardLoss, {}),
-    "goal": (make_goal_classifier, GoalLoss, {"pool": POOL}),
+    "inverse": (networks.make_inverse, InverseLoss, {}),
+    "imitation": (networks.make_policy, ImitationLoss, {}),
+    "instruction": (networks.make_instruction_classifier, InstructionLoss, {"pool": POOL}),
+    "reward": (networks.make_reward_model, RewardLoss, {}),
+    "goal": (networks.make_goal_classifier, GoalLoss, {"pool": POOL}),
 }
 
 

@@ -1,8 +1,6 @@
 """What every loss must do, whatever it is for."""
 
 import re
-import time
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -10,7 +8,6 @@ from tensordict import TensorDict
 from torchrl.objectives import LossModule
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.modules import evaluating
 from objectives.conftest import POOL, batch, make_loss, seeded, total
 
 
@@ -69,19 +66,6 @@ def test_it_may_be_of_another_precision(kind, preset, dtype):
     assert all(parameter.grad.isfinite().all() for parameter in loss.parameters())
 
 
-def test_state_round_trip(kind):
-    first = make_loss(kind)
-    second = make_loss(kind, make_options={"seed": 1})
-    with torch.no_grad():
-        for parameter in first.parameters():
-            parameter.add_(torch.randn_like(parameter) * 0.01)
-    second.load_state_dict(first.state_dict())
-    for loss in (first, second):
-        loss.eval()
-    found, expected = seeded(second, batch()).to_dict(), seeded(first, batch()).to_dict()
-    torch.testing.assert_close(found, expected, rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("network_training", [True, False])
 @pytest.mark.parametrize("loss_training", [True, False])
 def test_the_network_computes_in_the_mode_of_the_loss_and_keeps_its_own(
@@ -97,20 +81,6 @@ def test_the_network_computes_in_the_mode_of_the_loss_and_keeps_its_own(
     with pytest.raises((UserError, RuntimeError)):
         loss(batch().set("pixels", torch.zeros(12, 3, 8, 8)))
     assert {part.training for part in loss.network.modules()} == {network_training}
-
-
-def test_threads_do_not_take_one_anothers_mode_for_a_networks_own():
-    loss = make_loss("inverse")
-
-    def compute(mode):
-        with mode():
-            time.sleep(0.02)
-            return loss.network.training
-
-    with ThreadPoolExecutor(3) as pool:
-        modes = [loss._mode, loss._mode, lambda: evaluating(loss.network)]
-        assert [*pool.map(compute, modes)] == [True, True, False]
-    assert not loss.network.training
 
 
 def test_keys_of_networks_and_losses_can_be_nested(kind):

@@ -1,6 +1,5 @@
 """Values worked out by hand, from networks that answer what they are told."""
 
-import copy
 import math
 from functools import partial
 
@@ -184,15 +183,6 @@ def test_a_mixture_drops_nothing_however_many_are_suitable():
     assert float(mixture["removed"]) == 0
 
 
-def test_images_are_encoded_once_whatever_the_number_of_negatives():
-    loss = make_loss("instruction", negatives=11)
-    rows = []
-    image = loss.network.module.trunk.image
-    image.register_forward_hook(lambda _, args, out: rows.append(len(out)))
-    loss(batch((7,)))
-    assert rows == [7]
-
-
 def scores(table, all_actions=True) -> TensorDictModule:
     """A reward model that gives row by row the logits of a table, one action each or all."""
 
@@ -327,14 +317,6 @@ def test_the_share_of_suitable_pairs_comes_from_random_ones_alone(kind, options,
     loss.negatives.estimate.ratio = 100
     loss(batch())
     assert seen == [(int(batch()["final"].sum()) if kind == "goal" else 12, random)]
-
-
-def test_what_words_said_to_another_loss_is_not_penalised():
-    policy, steps = make_loss("imitation", "strong").network.train(), batch((4,))
-    policy.get_dist(steps.copy()).log_prob(steps["action"]).mean().backward()
-    copy.deepcopy(policy)  # of a network, not of a graph
-    losses = ImitationLoss(policy.eval()).eval()(steps)
-    assert losses["loss_words"] == 0
 
 
 def test_adversarial_training_leaves_out_padding():

@@ -51,25 +51,6 @@ def test_removal_does_not_feed_itself():
     assert negatives.keep(torch.rand(1024)).sum() == 960
 
 
-def test_scores_of_both_kinds_reach_back_as_far():
-    negatives = NegativeInstructions(POOL, None)
-    rows = torch.arange(4096, dtype=torch.float32)
-    for batch in rows.split(128):
-        negatives.watch(batch, batch.unsqueeze(1).expand(-1, 32))
-    assert torch.equal(negatives.estimate.positive, rows)
-    assert torch.equal(negatives.estimate.unlabelled, rows.repeat_interleave(8))
-
-
-def test_where_few_are_suitable_after_the_warm_up_none_are_removed_for_good():
-    negatives = NegativeInstructions(POOL, None, warmup=0.5)
-    negatives.progress = 0.6
-    negatives.watch(*scored(1 / 32))
-    assert negatives.keep(torch.rand(1024)).all()
-    negatives.watch(*scored(1 / 16))
-    assert negatives.keep(torch.rand(1024)).all()
-    assert negatives.suitable_share() == 1 / 16
-
-
 def test_the_bound_of_removal_travels_with_the_state_and_no_look_moves_it():
     negatives, other = (NegativeInstructions(POOL, None, warmup=0.5) for _ in range(2))
     negatives.watch(*scored(1 / 8))

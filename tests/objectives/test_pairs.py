@@ -54,20 +54,6 @@ def test_near_negatives_differ_in_few_words(monkeypatch):
     assert negatives.uniform(10) == 5
 
 
-def test_the_nearest_are_found_once_for_each_instruction(monkeypatch):
-    words = torch.cartesian_prod(*[torch.arange(1, 4)] * 4)
-    negatives = NegativeInstructions(words, 0.0, near=0.5)
-    foreign = torch.full((1, 4), 9)
-    asked = torch.cat([words[[5, 5, 70]], foreign])
-    found = negatives._known(asked)
-    assert torch.equal(found, negatives._nearest(asked))
-    monkeypatch.setattr(negatives, "_nearest", None)
-    assert torch.equal(negatives._known(asked[[3, 1]]), found[[3, 1]])
-    monkeypatch.undo()
-    monkeypatch.setattr(pairs, "WORDS_AT_ONCE", 1)  # a sentence at a time
-    assert torch.equal(negatives._nearest(asked), found)
-
-
 @pytest.mark.parametrize(
     ("pool", "options", "message"),
     [

@@ -1,7 +1,5 @@
 """Animations and galleries show the frames that they were given."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 
@@ -11,17 +9,11 @@ import torch
 from PIL import Image
 from tensordict.nn import TensorDictModule
 
+from ifo_grounding import report
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Episode
 from ifo_grounding.evaluation.tracing import Trace
-from ifo_grounding.report import (
-    Captioned,
-    animation,
-    gallery,
-    instruction_cases,
-    trace_animation,
-)
-from ifo_grounding.report.drawing import BORDER, PADDING, wrapped
+from ifo_grounding.report.drawing import BORDER, PADDING
 from ifo_grounding.report.theme import BAD, GOOD, RUNNING
 from ifo_grounding.tasks import grammar
 
@@ -52,7 +44,7 @@ def near(pixel, colour):
 def test_frames_outcomes_and_waiting():
     short = episode([(255, 0, 0), (0, 0, 255)], success=True)
     long = episode([(0, 255, 0)] * 3 + [(255, 255, 0)], success=False)
-    frames, durations = frames_of(animation([short, long], width=100))
+    frames, durations = frames_of(report.animation([short, long], width=100))
     assert durations == [250, 250, 250, 2500]
     middle = (PADDING + BORDER + 40, PADDING + BORDER + 40)
     cell = 2 * 48 + 2 * BORDER + PADDING + (100 - 96)
@@ -64,31 +56,25 @@ def test_frames_outcomes_and_waiting():
         assert near(frame[PADDING + 1, PADDING + 1 + cell], BAD if step == 3 else RUNNING)
 
 
-def test_captions_are_wrapped_not_cut():
-    text = "pick up the yellow triangle and place it to the right of the blue circle"
-    lines = wrapped(text, 200)
-    assert len(lines) > 1 and " ".join(lines) == text
-
-
 def test_animation_refusals():
     with pytest.raises(UserError, match="at least one episode"):
-        animation([])
+        report.animation([])
     with pytest.raises(UserError, match="one per episode"):
-        animation([episode([(0, 0, 0)] * 2, True)], titles=["a", "b"])
+        report.animation([episode([(0, 0, 0)] * 2, True)], titles=["a", "b"])
     with pytest.raises(UserError, match="6 actions and 3 names"):
-        animation([episode([(0, 0, 0)] * 2, True)], actions="LRS")
+        report.animation([episode([(0, 0, 0)] * 2, True)], actions="LRS")
     with pytest.raises(UserError, match=r"uint8 \[C, H, W\]"):
-        animation([Episode(np.zeros((2, 48, 48, 3)), np.array([5]), "a", True, True, 0)])
+        report.animation([Episode(np.zeros((2, 48, 48, 3)), np.array([5]), "a", True, True, 0)])
 
 
 def test_gallery_marks_the_unsuitable():
     picture = np.zeros((3, 48, 48), np.uint8)
-    cases = [Captioned(picture, "move", colour=colour) for colour in (GOOD, BAD)]
-    sheet = np.asarray(Image.open(io.BytesIO(gallery(cases, width=96)))).astype(int)
+    cases = [report.Captioned(picture, "move", colour=colour) for colour in (GOOD, BAD)]
+    sheet = np.asarray(Image.open(io.BytesIO(report.gallery(cases, width=96)))).astype(int)
     assert near(sheet[PADDING + 1, PADDING + 1], GOOD)
     assert near(sheet[PADDING + 1, 2 * PADDING + 2 * BORDER + 96 + 1], BAD)
     with pytest.raises(UserError, match="at least one picture"):
-        gallery([])
+        report.gallery([])
 
 
 def test_cases_show_suitable_and_unsuitable_choices():
@@ -97,12 +83,12 @@ def test_cases_show_suitable_and_unsuitable_choices():
 
     yes = TensorDictModule(score, ["pixels", "instruction"], ["suitability"])
     pool = grammar("move").tokens
-    cases = instruction_cases(yes, "move", pool)
+    cases = report.instruction_cases(yes, "move", pool)
     assert [case.colour for case in cases] == [GOOD] * 8 + [BAD] * 4
     assert all(case.note == "suitable (0.95)" for case in cases[:8])
     assert "missing (0.95)" in {case.note for case in cases}
     assert cases[0].frame.shape == (3, 192, 192)
-    none = instruction_cases(yes, "move", pool, threshold=0.99)
+    none = report.instruction_cases(yes, "move", pool, threshold=0.99)
     assert none == []
 
 
@@ -116,8 +102,8 @@ def test_a_step_is_a_picture_and_a_dollar_sign_no_formula():
         rewards={"$^": np.full(2, 0.5, np.float32)},
     )
     shown.actions[:] = 1
-    frames, _ = frames_of(trace_animation(trace, actions=["$_", "go", "$}"]))
+    frames, _ = frames_of(report.trace_animation(trace, actions=["$_", "go", "$}"]))
     assert len(frames) == 2
     with pytest.raises(UserError, match="3 actions and 6 names"):
-        trace_animation(trace)
-    assert frames_of(animation([shown], actions=["$_", "$^"]))
+        report.trace_animation(trace)
+    assert frames_of(report.animation([shown], actions=["$_", "$^"]))

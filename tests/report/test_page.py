@@ -1,11 +1,8 @@
 """The page holds everything, escapes everything, and needs nothing."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -14,37 +11,7 @@ import torch
 from ifo_grounding.errors import UserError
 from ifo_grounding.report import Captioned, training_curves, write_report
 from ifo_grounding.stats import paired_difference, wilson
-
-VOID = {"meta", "img", "source", "br", "link", "input", "hr"}
-
-
-class Outline(HTMLParser):
-    """Collects texts, attributes, and unbalanced tags."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.texts, self.sources, self.headings = [], [], [], []
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in VOID:
-            self.open.append(tag)
-        self.sources += [value for key, value in attrs if key in ("src", "srcset", "href")]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] == "h2":
-            self.headings.append(data)
-        if data.strip() and "style" not in self.open:
-            self.texts.append(data.strip())
-
-
-def read(page):
-    outline = Outline()
-    outline.feed(page.read_text())
-    assert outline.open == []
-    return outline
+from outline import read
 
 
 @pytest.fixture

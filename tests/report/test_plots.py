@@ -1,20 +1,13 @@
 """Plots show the numbers that they were given."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from ifo_grounding import report
 from ifo_grounding.errors import UserError
-from ifo_grounding.report import (
-    figure_png,
-    rates_by_number,
-    reliability_diagram,
-    training_curves,
-)
 from ifo_grounding.report.theme import BAD, GOOD, PALETTE, RUNNING
 from ifo_grounding.stats import wilson
 
@@ -37,7 +30,7 @@ def logged(**metrics):
 def test_curves_hold_the_values_and_their_running_mean():
     values = [float(i % 2) + 1 for i in range(100)]
     history = logged(loss=values, other=[None] * 99 + [1.0], lr=[float("nan")] * 100)
-    figure = training_curves(history, ["loss", "other", "lr"])
+    figure = report.training_curves(history, ["loss", "other", "lr"])
     loss, other = figure.axes  # nothing is known of the third
     assert loss.get_title(loc="left") == "loss"
     raw, mean = loss.lines
@@ -45,13 +38,13 @@ def test_curves_hold_the_values_and_their_running_mean():
     assert np.allclose(mean.get_ydata()[20:80], 1.5)
     assert other.lines[0].get_xydata().tolist() == [[99.0, 1.0]]
     with pytest.raises(UserError, match="logged were loss"):
-        training_curves(history, ["success"])
+        report.training_curves(history, ["success"])
     with pytest.raises(UserError, match="none"):
-        training_curves([])
+        report.training_curves([])
 
 
 def test_shares_are_drawn_in_percent_and_losses_are_not():
-    shares, losses = training_curves(logged(success=[0.2, 0.9], loss=[3.0, 1.0])).axes
+    shares, losses = report.training_curves(logged(success=[0.2, 0.9], loss=[3.0, 1.0])).axes
     assert shares.yaxis.get_major_formatter()(0.5) == "50%"
     assert losses.get_ylim()[1] > 1.02
 
@@ -65,7 +58,7 @@ def test_panels_leave_out_what_is_undefined_and_show_all_steps():
         "True success": {"success": "greedy", "success_sampled": "sampled"},
         "Entropy": {"entropy": "nats"},
     }
-    success, entropy = training_curves(history, panels).axes
+    success, entropy = report.training_curves(history, panels).axes
     assert success.get_title(loc="left") == "True success"
     assert success.get_xlim() == entropy.get_xlim() == (0.5, 8.5)
     assert [line.get_ydata().tolist() for line in success.lines] == [[1.0], [0.98]]
@@ -74,17 +67,10 @@ def test_panels_leave_out_what_is_undefined_and_show_all_steps():
 
 @pytest.mark.parametrize("text", ["$x", "a $ b $ c", r"$\frac$"])
 def test_a_dollar_sign_is_no_formula(text):
-    figure = training_curves(logged(**{text: [1.0, 2.0]}))
-    assert pixels(figure_png(figure)).shape[2] == 3
-    figure = rates_by_number({text: {text: {1: wilson(1, 2)}}})
-    assert pixels(figure_png(figure)).shape[2] == 3
-
-
-def test_drawing_leaves_no_global_state():
-    import matplotlib.pyplot as plt
-
-    figure_png(training_curves(logged(loss=[1.0])))
-    assert plt.get_fignums() == []
+    figure = report.training_curves(logged(**{text: [1.0, 2.0]}))
+    assert pixels(report.figure_png(figure)).shape[2] == 3
+    figure = report.rates_by_number({text: {text: {1: wilson(1, 2)}}})
+    assert pixels(report.figure_png(figure)).shape[2] == 3
 
 
 MACHADO = {  # Machado, Oliveira and Fernandes 2009, severity 1, for linear RGB
@@ -112,7 +98,7 @@ def test_colours_stay_apart_for_colour_blind_readers(kind, colours):
 
 def test_reliability_diagram_shows_every_bin_with_its_interval_and_count():
     bins = [(0.15, wilson(200, 1000)), (0.85, wilson(40, 50))]
-    axes = reliability_diagram(bins).axes[0]
+    axes = report.reliability_diagram(bins).axes[0]
     (points, _, _) = axes.containers[0]
     assert points.get_xydata().tolist() == [[0.15, 0.2], [0.85, 0.8]]
     assert [text.get_text() for text in axes.texts] == ["1,000", "50"]
@@ -121,7 +107,7 @@ def test_reliability_diagram_shows_every_bin_with_its_interval_and_count():
 def test_rates_by_number_shows_each_curve_in_its_panel():
     few, many = wilson(60, 100), wilson(80, 100)
     panels = {"move": {"phase 1": {500: few, 2000: many}, "phase 2": {2000: many}}, "pick": {}}
-    figure = rates_by_number(panels, references={"pick": {"the paper": 0.13}})
+    figure = report.rates_by_number(panels, references={"pick": {"the paper": 0.13}})
     first, second = figure.axes
     curve, _, (bars,) = first.containers[0]
     assert curve.get_xydata().tolist() == [[500, 0.6], [2000, 0.8]]
@@ -130,4 +116,4 @@ def test_rates_by_number_shows_each_curve_in_its_panel():
     assert second.lines[0].get_ydata() == [0.13, 0.13]
     assert second.get_ylim()[0] < 0.13
     with pytest.raises(UserError, match="at least one curve"):
-        rates_by_number({"move": {"phase 1": {}}})
+        report.rates_by_number({"move": {"phase 1": {}}})

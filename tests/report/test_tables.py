@@ -1,7 +1,5 @@
 """Tables letter by letter."""
 
-from __future__ import annotations
-
 import pytest
 
 from ifo_grounding.errors import UserError

@@ -1,11 +1,7 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
-from ifo_grounding.errors import UserError
 from ifo_grounding.tasks import MAX_STEPS, REASONS, TASKS, Goal, achieved, plan, verdict
-from ifo_grounding.tasks.goals import check_task
 from reference import BOXES, KINDS, SIDES, Plain, worlds
 
 
@@ -115,10 +111,3 @@ def test_other_objects_of_the_same_kind_are_alike():
     begin = scene({(2, 2): RED, (1, 1): RED}, BOTH)
     assert bool(achieved(begin, scene({(4, 4): RED, (1, 1): RED}, BOTH), goal(**OUT)))
     assert not bool(achieved(begin, scene({(2, 2): RED, (4, 4): RED}, BOTH), goal(**OUT)))
-
-
-def test_tasks_have_numbers():
-    assert TASKS == ("move", "move-udlr", "pick", "pick-out", "pick-udlr")
-    assert [check_task(task) for task in TASKS] == [0, 1, 2, 3, 4]
-    with pytest.raises(UserError, match="unknown task 'fly': choose one of 'move'"):
-        check_task("fly")

@@ -1,7 +1,6 @@
 import contextlib
 import csv
 import multiprocessing
-import sys
 import types
 
 import pytest
@@ -150,23 +149,6 @@ def test_metrics_are_logged_once_also_after_a_kill(tmp_path, logger):
         for key in events.Tags()["scalars"]:
             found[key] = [event.step for event in events.Scalars(key)]
     assert found == {"train/loss": [10, 20, 25, 30], "train/reward/loss": [20]}
-
-
-def test_all_stages_of_a_run_are_one_run_of_wandb(tmp_path, monkeypatch):
-    made, wandb = [], types.ModuleType("wandb")
-
-    def init(reinit=False, **options):
-        if reinit or not made:  # or the run at work is returned, also for another name
-            made.append((options["name"], options["id"]))
-        return types.SimpleNamespace(config={})
-
-    wandb.__spec__, wandb.init = types.SimpleNamespace(), init
-    monkeypatch.setitem(sys.modules, "wandb", wandb)
-    monkeypatch.setattr("torchrl.record.loggers.wandb._has_wandb", True)
-    for folder in ("one", "one", "other"):
-        Run(tmp_path / folder, "wandb").stage("imitate").log()
-    assert made[0] == made[1] and made[0][0] == "one"
-    assert made[2][0] == "other" and made[2][1] != made[0][1]
 
 
 def test_wandb_itself_takes_the_metrics_of_a_stage(tmp_path, monkeypatch):

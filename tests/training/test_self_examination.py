@@ -34,20 +34,14 @@ def of_pairs():
     return TransformedEnv(started, LearnedReward(tiny.likes(1)))
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reinforce"])
-def test_a_policy_learns_what_the_reward_model_likes(algorithm):
+@pytest.mark.parametrize(("algorithm", "name"), [("ppo", "worth"), ("reinforce", "state_value")])
+def test_a_policy_learns_what_the_reward_model_likes(algorithm, name):
+    """Whatever the name under which the value is written."""
     chosen = tiny.config(algorithm=algorithm, iterations=3, **tiny.TEACH)
-    history = self_examine(tiny.make_env(tiny.likes(1), 32), *tiny.make_networks(), chosen, seed=0)
+    networks = tiny.make_networks(name)
+    history = self_examine(tiny.make_env(tiny.likes(1), 32), *networks, chosen, seed=0)
     assert history[0]["learned_reward"] < 0.35
     assert history[-1]["learned_reward"] > 0.6
-
-
-def test_a_value_may_write_under_any_name():
-    found = [
-        self_examine(tiny.make_env(), *tiny.make_networks(name), tiny.config(gamma=0.9), seed=0)
-        for name in ("state_value", "worth")
-    ]
-    assert found[0][-1]["loss_critic"] == found[1][-1]["loss_critic"]
 
 
 def test_value_warm_up_leaves_the_policy_as_it_was():

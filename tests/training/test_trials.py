@@ -3,8 +3,7 @@ import torch
 
 from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.objectives import ImitationLoss
-from ifo_grounding.seeding import derive
-from ifo_grounding.training import FitConfig, Trial, fit, successive_halving, trial_seed
+from ifo_grounding.training import FitConfig, Trial, fit, successive_halving
 from training.tiny import make_policy, same, weights
 
 CONFIG = FitConfig(steps=30, batch_size=16, lr=1e-2, iteration=5)
@@ -67,8 +66,3 @@ def test_trials_that_were_killed_end_in_the_same_choice(trial):
     again = [trial(number) for number in range(2)]
     assert [each.learn(10) for each in again] == losses
     assert again[0].learn(100) == again[0].learn(30)  # no more steps than there are
-
-
-def test_the_first_trial_has_the_seed_of_the_run():
-    assert trial_seed(3, 0) == 3
-    assert trial_seed(3, 2) == derive(3, "beginning", 2)

@@ -5,8 +5,6 @@ stops. The instruction [t, 0, 0, 0] asks to reach t - 1; it is suitable where th
 smaller than that.
 """
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule

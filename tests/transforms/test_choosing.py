@@ -1,7 +1,5 @@
 """PoolScorer, by hand-computed scores."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -88,36 +86,6 @@ def test_each_instruction_is_encoded_once_until_a_weight_changes():
     network.sharpness.data.fill_(2.0)
     assert scorer.score(scorer.encode(pixels(0)), torch.tensor([[0, 9]])).tolist() == [[-2.0, 2.0]]
     assert network.encoded == 30
-
-
-def test_mode_is_eval_while_scoring_and_restored():
-    model = classifier()
-    model.train()
-    model.module.dropout.eval()
-    modes = []
-    model.module.dropout.register_forward_hook(lambda part, *_: modes.append(part.training))
-    assert choose([0] * 20, model).chosen.min() > 0
-    assert modes and not any(modes)
-    assert model.training and model.module.training and not model.module.dropout.training
-
-
-def test_large_batches_are_scored_in_parts():
-    sizes = []
-
-    def sized(pixels, instruction):
-        sizes.append(len(pixels))
-        return torch.full((len(pixels), 1), -9.0)
-
-    assert len(choose([8] * 1000, classifier(network=sized)).chosen) == 1000
-    assert max(sizes) <= 2048 and sum(sizes) == 10_000
-
-
-def test_a_random_choice_scores_no_more_than_it_needs():
-    scorer = PoolScorer(classifier(), POOL)
-    scorer.choose(pixels(*[0] * 100))
-    assert 400 <= scorer.scored < 500
-    scorer.choose(pixels(*[0] * 100), choose="best")
-    assert scorer.scored >= 1400
 
 
 def test_candidates_are_distinct_and_uniform():

@@ -1,11 +1,8 @@
 """What TorchRL asks of a transform: single, serial, parallel, composed, nested, collected."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.testing import rollout_consistency_assertion
@@ -120,15 +117,6 @@ def test_with_parallel_workers(name, world):
         check(TransformedEnv(workers) if world is inside else around(workers, name), name)
     finally:
         workers.close()
-
-
-@pytest.mark.parametrize("name", ["sampler and rewards", "pairs and rewards"])
-def test_collected(name):
-    collector = Collector(inside(name, (4,)), frames_per_batch=60, total_frames=120)
-    batches = list(collector)
-    collector.shutdown()
-    for batch in batches:
-        assert torch.equal(batch["next", "instruction"], batch["instruction"])
 
 
 @pytest.mark.parametrize("order", [(sampler, action, goal), (goal, action, sampler)])

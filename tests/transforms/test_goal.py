@@ -1,7 +1,5 @@
 """GoalReward: hand-computed pay at stops, at ends, on arrival."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict.nn import TensorDictModule

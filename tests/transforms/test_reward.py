@@ -1,7 +1,5 @@
 """LearnedReward and what both rewards share: hand-computed pay on environments and batches."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -52,14 +50,6 @@ def test_large_batches_are_scored_in_parts():
     paid = LearnedReward(model)(batch)["next", "learned_reward"]
     assert torch.equal(paid[:, 0], torch.arange(10_000.0).sigmoid())
     assert sizes == [4096, 4096, 1808]
-
-
-def test_mode_of_the_model_is_left_alone():
-    model = reward_model().train()
-    rollout = make(LearnedReward(model)).rollout(30, expert, break_when_any_done=False)
-    assert torch.allclose(rollout["next", "learned_reward"], torch.tensor(RIGHT))
-    assert model.training and model.module.dropout.training
-    assert not rollout["next", "learned_reward"].requires_grad
 
 
 def test_keys_that_do_not_fit_are_refused():

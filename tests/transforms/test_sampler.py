@@ -1,7 +1,5 @@
 """InstructionSampler: what it writes, whose states it redraws, whom it refuses."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

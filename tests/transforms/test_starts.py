@@ -1,7 +1,5 @@
 """StartingPairs: every pair once, with its own scene, before any is used again."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest

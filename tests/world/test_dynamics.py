@@ -1,12 +1,8 @@
-from __future__ import annotations
-
 import pytest
 import torch
 
-from ifo_grounding.keys import ACTIONS
 from ifo_grounding.seeding import Lots
-from ifo_grounding.world import neighbour, random_layout, step
-from ifo_grounding.world.dynamics import DOWN, LEFT, PICK_PLACE, RIGHT, STOP, UP
+from ifo_grounding.world import random_layout, step
 from reference import LETTERS, Plain, plain, worlds
 
 RED, BLUE = "red circle", "blue diamond"
@@ -15,11 +11,6 @@ NEAR, FAR = ((2, 3), RED), ((4, 4), BLUE)
 
 def world(arm, held=None, *objects) -> Plain:
     return Plain(6, arm, held, frozenset(objects), frozenset({((0, 0), "green")}))
-
-
-def test_actions_are_in_the_order_of_the_paper():
-    assert "".join(ACTIONS) == LETTERS == "URDLPS"
-    assert (UP, RIGHT, DOWN, LEFT, PICK_PLACE, STOP) == (0, 1, 2, 3, 4, 5)
 
 
 @pytest.mark.parametrize(
@@ -58,9 +49,3 @@ def test_steps_of_any_batch_shape_are_steps_of_its_rows():
     together = step(state.reshape(3, 4), actions.reshape(3, 4))
     assert together.batch_size == torch.Size([3, 4])
     assert (together.reshape(12) == step(state, actions)).all()
-
-
-def test_neighbours_at_a_corner():
-    cells, inside = neighbour(torch.zeros(4, dtype=torch.int64), torch.arange(4), 6)
-    assert cells.tolist() == [0, 1, 6, 0]
-    assert inside.tolist() == [False, True, True, False]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 import torch
 from scipy import stats
@@ -38,17 +36,6 @@ def test_colours_kinds_and_arms_are_equally_likely(drawn):
         assert ((drawn.boxes == colour).sum(-1) <= 1).all()
 
 
-def test_every_cell_is_equally_likely(drawn):
-    # Counts per cell over scenes are not quite multinomial (cells of a scene exclude each other),
-    # which makes the test a little too kind, not too strict: so compare the spread as well.
-    for cells in (drawn.objects, drawn.boxes):
-        counts = (cells > 0).sum(0)
-        share = counts.sum() / (N * 36)
-        deviation = (counts - N * share) / (N * share * (1 - share)).sqrt()
-        assert deviation.abs().max() < 4.2
-        assert uniform(counts) > 1e-4
-
-
 def test_about_a_third_of_the_objects_starts_inside_a_box(drawn):
     exists, boxed = drawn.objects > 0, (drawn.objects > 0) & (drawn.boxes > 0)
     share = boxed.sum() / exists.sum()
@@ -58,14 +45,6 @@ def test_about_a_third_of_the_objects_starts_inside_a_box(drawn):
     alone = random_layout(Lots(1, torch.arange(N)), plenty)
     share = ((alone.objects > 0) & (alone.boxes > 0)).sum() / N
     assert abs(share - 0.35) < 4 * (0.35 * 0.65 / N) ** 0.5
-
-
-def test_the_share_inside_boxes_can_be_chosen():
-    never = random_layout(Lots(0, torch.arange(500)), Layout(inside=0.0))
-    assert not ((never.objects > 0) & (never.boxes > 0)).any()
-    always = Layout(objects=(3, 3), boxes=(3, 3), inside=1.0)
-    state = random_layout(Lots(0, torch.arange(500)), always)
-    assert ((state.objects > 0) == (state.boxes > 0)).all()
 
 
 @pytest.mark.parametrize("size", [3, 10])
@@ -82,7 +61,6 @@ def test_grids_of_other_sizes(size):
     ("wrong", "said"),
     [
         ({"size": 2}, "3..16"),
-        ({"size": 17}, "3..16"),
         ({"objects": (5, 4)}, "objects must be"),
         ({"objects": (-1, 4)}, "objects must be"),
         ({"boxes": (2, 8)}, r"within 0\.\.7"),
