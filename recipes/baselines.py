@@ -201,7 +201,9 @@ def adversarial(options: Options) -> Run:
     begun = load_network(run, REFERENCE, "baselines", options) if method == "gail+bc" else None
     policy = build(make_policy, options) if begun is None else begun
     value = build(make_value, options, init_from=policy)
-    seen = access(options, run)
+    seen, more = access(options, run), options.networks.changed()
+    if method == "gaifo":
+        more["inverse"] = load_network(run, INVERSE, "train_inverse", options)
     adversary = ADVERSARIES[method](
         seen,
         options.preset,
@@ -211,7 +213,7 @@ def adversarial(options: Options) -> Run:
         stop_action=world.stop_action,
         seed=options.seed,
         device=options.device,
-        **options.networks.changed(),
+        **more,
     )
     practice = options.self_examine
     worlds, rounds = practice.num_envs, practice.num_envs * practice.steps

@@ -11,6 +11,7 @@ from ifo_grounding.baselines import (
     AGILE,
     GAIL,
     ActionDemonstrations,
+    ChangeNetwork,
     ChosenAGILE,
     DiscriminatorLoss,
     DiscriminatorReward,
@@ -161,9 +162,24 @@ def test_the_reward_of_a_step_is_that_of_what_it_led_to(sources):
     adversary = GAIfO(sources["frames"], **SMALL)
     env = sources["steps"].starts(seed=2).append_transform(adversary.reward)
     rollout = env.rollout(6, break_when_any_done=False)
-    logits = adversary.network(rollout.reshape(-1))["goal_score"]
+    logits = adversary.network(rollout.reshape(-1))["change_score"]
     paid = rollout["next", "learned_reward"].reshape(-1, 1)
     torch.testing.assert_close(paid, logits, rtol=1e-4, atol=1e-4)
+
+
+def test_a_change_is_scored_as_the_kind_that_it_looks_like():
+    class Kinds(torch.nn.Module):
+        def all_actions(self, before, said):
+            return torch.tensor([[2.0, -4.0, 7.0]]) * before * said
+
+    def inverse(before, after):
+        return torch.stack([after, -after, 9.0 * before.squeeze(-1)], -1)
+
+    network = ChangeNetwork(inverse, Kinds())
+    before, after, said = torch.full((2, 1), 3.0), torch.full((2,), math.log(2)), torch.tensor(0.5)
+    scored = network(before, after, torch.tensor([[False], [True]]), said)
+    # Odds of 4 to 1 for the first kind, whose score is 3, of the other -6; the end's is 10.5.
+    torch.testing.assert_close(scored, torch.tensor([[0.8 * 3 - 0.2 * 6], [10.5]]))
 
 
 @pytest.mark.parametrize("name", ["actions", "frames", "steps"])

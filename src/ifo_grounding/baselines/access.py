@@ -16,23 +16,25 @@ from ifo_grounding.data.buffers import frame_buffer
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import generator
 
-AFTER = (keys.NEXT, keys.PIXELS)
+AFTER, ENDED = (keys.NEXT, keys.PIXELS), (keys.NEXT, "terminated")
 
 
 def transitions_of(demos: Demonstrations, last: bool = False) -> TensorDictReplayBuffer:
     """Put transitions without actions into a replay buffer.
 
-    A sample holds ``pixels`` and ``("next", "pixels")``, uint8 [B, C, H, W], and ``instruction``
-    int64 [B, L].
+    A sample holds ``pixels`` and ``("next", "pixels")``, uint8 [B, C, H, W], ``instruction``
+    int64 [B, L], and ``("next", "terminated")`` bool [B, 1]: the stops of demonstrations that show
+    theirs.
 
     Args:
-        last: whether only those to the last frame of demonstrations that show their stop.
+        last: whether only those stops.
     """
     episode, frame = demos.locate()
+    ended = demos.closed[episode] & (frame == (demos.starts + demos.lengths - 2)[episode])
     if last:
-        chosen = demos.closed[episode] & (frame == (demos.starts + demos.lengths - 2)[episode])
-        episode, frame = episode[chosen], frame[chosen]
+        episode, frame, ended = episode[ended], frame[ended], ended[ended]
     stored = {keys.PIXELS: frame, AFTER: frame + 1, keys.INSTRUCTION: episode}
+    stored[ENDED] = ended.unsqueeze(-1)
     return frame_buffer(demos, stored, [keys.PIXELS, AFTER])
 
 

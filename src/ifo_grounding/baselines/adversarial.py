@@ -14,12 +14,13 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 
 from ifo_grounding import keys
 from ifo_grounding.baselines.access import (
     AFTER,
+    ENDED,
     ActionDemonstrations,
     SteppableDemonstrations,
     check_access,
@@ -28,10 +29,11 @@ from ifo_grounding.baselines.access import (
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.errors import UserError, share
 from ifo_grounding.networks import (
-    make_goal_classifier,
     make_instruction_classifier,
+    make_inverse,
     make_reward_model,
 )
+from ifo_grounding.networks.trunk import RewardNetwork
 from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.training import AdversarialUpdates
 from ifo_grounding.transforms.base import rows_of
@@ -112,8 +114,11 @@ class DiscriminatorReward(RewardTransform):
     """
 
     def __init__(self, discriminator: TensorDictModuleBase, at_stop: int | None = None) -> None:
-        self.later = [key == AFTER for key in discriminator.in_keys]
-        read = [keys.PIXELS if key == AFTER else key for key in discriminator.in_keys]
+        self.later = [key in (AFTER, ENDED) for key in discriminator.in_keys]
+        read = [
+            key[-1] if later else key
+            for key, later in zip(discriminator.in_keys, self.later, strict=True)
+        ]
         also = [] if at_stop is None else [keys.ACTION]
         super().__init__(discriminator, str(discriminator.out_keys[0]), [*read, *also], None, also)
         self.at_stop = at_stop
@@ -208,8 +213,36 @@ class GAIL(Adversary):
         return make_reward_model(demos, preset, **options)
 
 
+class ChangeNetwork(nn.Module):
+    """Scores what a change of state looks like: a logit [*B, 1].
+
+    An inverse model tells kinds of change apart, a reward model scores each kind in the light of
+    the instruction, and an episode's end is a kind of its own: to the eye a stop is any step that
+    changes nothing. Both models learn together, and read no action.
+    """
+
+    def __init__(self, inverse: nn.Module, reward: RewardNetwork) -> None:
+        super().__init__()
+        self.inverse, self.reward = inverse, reward
+
+    def forward(self, before: Tensor, after: Tensor, ended: Tensor, instruction: Tensor) -> Tensor:
+        """Weigh the score of each kind by how much the change is of that kind.
+
+        Args:
+            before, after: states, uint8 [*B, C, H, W].
+            ended: whether the episode ends there by a stop, bool [*B, 1].
+            instruction: token ids, int64 [*B, L].
+        """
+        kinds = self.inverse(before, after)[..., :-1].softmax(-1) * ~ended
+        kinds = torch.cat([kinds, ended.to(kinds.dtype)], -1)
+        return (kinds * self.reward.all_actions(before, instruction)).sum(-1, keepdim=True)
+
+
 class GAIfO(Adversary):
-    """Tells demonstrated changes from the policy's: state, next state, instruction."""
+    """Tells demonstrated changes from the policy's: state, next state, instruction.
+
+    With ``inverse=`` the discriminator begins with an inverse model, which learns on with it.
+    """
 
     access: type[Any] = Demonstrations
 
@@ -217,8 +250,10 @@ class GAIfO(Adversary):
         return transitions_of(seen)
 
     def discriminator(self, demos: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
-        in_keys = (keys.PIXELS, AFTER, keys.INSTRUCTION)
-        return make_goal_classifier(demos, preset, in_keys=in_keys, **options)
+        inverse = options.pop("inverse", None) or make_inverse(demos, preset, **options)
+        network = ChangeNetwork(inverse.module, make_reward_model(demos, preset, **options).module)
+        in_keys = [keys.PIXELS, AFTER, ENDED, keys.INSTRUCTION]
+        return TensorDictModule(network, in_keys, ["change_score"]).eval()
 
 
 class AGILE(Adversary):
