@@ -6,7 +6,7 @@ python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -60,6 +60,8 @@ class ReproduceOptions:
     """Chains of pieces side by side, each on one thread."""
     device: str = "cpu"
     """Where they are made."""
+    tune: bool = False
+    """With ``table=1``: run the trials of ``tuning`` on validation scenes instead of the table."""
     list: bool = False
     """Only say what is done and what is not."""
     results: str = "results"
@@ -76,6 +78,11 @@ class ReproduceOptions:
     """Further ones by piece."""
     method: dict[str, Any] = field(default_factory=dict)
     """Options of the methods of Table 1."""
+    tuned: dict[str, Any] = field(default_factory=dict)
+    """Further ones of all trials."""
+    tuning: dict[str, Any] = field(default_factory=dict)
+    """Search space of each method of Table 1: options with their values, a trial for each
+    combination."""
     level: dict[str, Any] = field(default_factory=dict)
     """Options of levels of BabyAI."""
 
@@ -146,7 +153,7 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
     if options.table == 1:
         numbers = options.demonstrations or [200, 2000, 20_000]
         chains += [
-            [of_method(options, task, preset, n, seed, method) for method in METHODS]
+            list(of_methods(options, task, preset, n, seed))
             for seed, n, preset, task in product(
                 options.seeds, numbers, options.presets, options.tasks
             )
@@ -174,19 +181,31 @@ def piece(
     return call(options, name.format(phase), chosen, file, base)
 
 
-def of_method(
-    options: ReproduceOptions, task: str, preset: str, n: int, seed: int, method: str
-) -> Piece:
-    """Return the piece of one method of Table 1; all of a chain go on with one run."""
+def of_methods(
+    options: ReproduceOptions, task: str, preset: str, n: int, seed: int
+) -> Iterator[Piece]:
+    """Yield a piece for each method of Table 1, of one run, or for each trial, of a run each."""
     name = f"{task}-{n}-{preset}"
     chosen: list[Mapping[str, Any]] = [
         {"task": task, "preset": preset, "seed": seed, "demonstrations": {"n": n}},
-        {"method": method},
         options.method,
     ]
-    file = f"baselines/{name}-{method}-seed{seed}.json"
-    made = call(options, f"baselines-{name}-seed{seed}", chosen, file, None)
-    return replace(made, recipe="baselines")
+    if not options.tune:
+        for method in METHODS:
+            file = f"baselines/{name}-{method}-seed{seed}.json"
+            run = f"baselines-{name}-seed{seed}"
+            yield replace(
+                call(options, run, [*chosen, {"method": method}], file, None), recipe="baselines"
+            )
+        return
+    for method, space in options.tuning.items():
+        for number, values in enumerate(product(*space.values())):
+            trial = dict(zip(space, values, strict=True))
+            of_trial = {"method": method, "variant": f"trial{number}"}
+            file = f"tuning/{name}-trial{number}-{method}-seed{seed}.json"
+            run = f"tuning-{name}-{method}-{number}-seed{seed}"
+            made = call(options, run, [*chosen, options.tuned, of_trial, trial], file, None)
+            yield replace(made, recipe="baselines")
 
 
 def of_level(options: ReproduceOptions, level: str, n: int, seed: int) -> Piece:

@@ -119,3 +119,20 @@ def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_pa
         assert first.run == last.run and first.seed == 3
         assert (first.budget, first.evaluate.episodes) == (budget, 5000)
     assert chains[0][0].file == tmp_path / "results/baselines/move-200-strong-bc-seed3.json"
+
+
+def test_every_method_of_table_1_is_tuned_by_as_many_trials(reproduce_options):
+    from reproduce import pieces
+
+    from ifo_grounding.baselines.config import METHODS
+
+    asked = reproduce_options("table=1", "tune=true", "tasks=[move]", "demonstrations=[200]")
+    (of_strong, _) = pieces(asked)
+    given = [options_of(*piece.arguments) for piece in of_strong]
+    trials = {method: [each for each in given if each.method == method] for method in METHODS}
+    counts = {method: len(each) for method, each in trials.items()}
+    assert counts == dict.fromkeys(METHODS, 6) | {"random": 0, "expert": 0}
+    assert len({each.run for each in given}) == len({piece.file for piece in of_strong}) == 60
+    assert {each.evaluate.stream for each in given} == {"validation"}
+    of_gail = {(each.baseline.lr, each.baseline.steps) for each in trials["gail"]}
+    assert of_gail == {(lr, steps) for lr in (3e-4, 1e-3, 3e-3) for steps in (10, 30)}
