@@ -13,8 +13,8 @@ from ifo_grounding.report import (
     rates_by_number,
     training_curves,
 )
-from ifo_grounding.report.results import brief
-from ifo_grounding.stats import Rate, holm
+from ifo_grounding.report.results import brief, unpacked
+from ifo_grounding.stats import Difference, Rate, holm, paired_difference
 from ifo_grounding.tasks import TASKS
 
 LEVELS = ("GoToObj", "GoToLocal", "PickupLoc")
@@ -43,7 +43,7 @@ def study_rows() -> dict[tuple[str, int], Row]:
         row = {"task": task, "demonstrations": f"{number:,}", "seeds": len(runs)}
         row |= {"phase 1": success(runs, "phase1"), "phase 2": success(runs, "phase2")}
         row |= {"gain, points": gain(runs), "over continued imitation": over_continued(runs)}
-        row["p"] = f"{p[task, number]:.2g}" if p[task, number] >= 1e-4 else "< 0.0001"
+        row["p"] = shown_p(p[task, number])
         rows[task, number] = row
     return rows
 
@@ -131,15 +131,36 @@ def by_method(task: str, number: int) -> dict[str, Runs]:
 
 
 def baseline_rows(task: str, number: int) -> list[Row]:
-    rows = []
-    for method, runs in by_method(task, number).items():
+    """Return a row for each method; p is corrected for the number of rivals of ours."""
+    found, rows = by_method(task, number), []
+    behind = {m: ahead(runs, m, found) for m, runs in found.items() if ACCESS[m][0]}
+    behind = {method: each for method, each in behind.items() if each}
+    p = dict(zip(behind, holm([each.p_value for each in behind.values()]), strict=True))
+    for method, runs in found.items():
         actions, steps, what = ACCESS[method]
         row = {"method": f"`{method}`", "what it is": what, "true actions": actions}
         row |= {"steps from demonstrations": steps, "seeds": len(runs)}
         curve = runs[0]["results"].get("curve")
         row["frames of policy gradient"] = f"{curve[-1][0] / 1e6:.1f}M" if curve else ""
-        rows.append({**row, "success": brief(rate(runs, method))})
+        row["success"] = brief(rate(runs, method))
+        row["ours ahead, points"] = brief(behind[method]) if method in p else ""
+        row["p"] = shown_p(p[method]) if method in p else ""
+        rows.append(row)
     return rows
+
+
+def ahead(runs: Runs, method: str, found: dict[str, Runs]) -> Difference | None:
+    """Return by how much ours is ahead of a method on the same scenes with the same seeds."""
+    ours = {run["options"]["seed"]: run for run in found.get("ours", ())}
+    both = [run for run in runs if run["options"]["seed"] in ours]
+    if method == "ours" or not both:
+        return None
+    same = [ours[run["options"]["seed"]] for run in both]
+    return paired_difference(unpacked(both, method), unpacked(same, "ours"))
+
+
+def shown_p(value: float) -> str:
+    return f"{value:.2g}" if value >= 1e-4 else "< 0.0001"
 
 
 def baseline_curves(task: str, number: int) -> bytes:
