@@ -11,7 +11,7 @@ from ifo_grounding.data import record_demonstrations
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.seeding import derive
 
-WORLDS, STEPS, ROUNDS = 128, 32, 40
+WORLDS, STEPS, ROUNDS = 128, 32, 30
 EVERY = 10
 """Rounds between two measures."""
 DEMONSTRATIONS, EPISODES = 200, 1000
