@@ -1,17 +1,22 @@
 """Draw the pictures of the README: ``python docs/make_assets.py RUN`` after a demo run.
 
 ``world.png`` shows a scene of each task; ``before-after.gif`` what phase 2 of that run (a name
-or a path) has mended.
+or a path) has mended; ``playground.gif`` the page at work, with the same run.
 """
 
+import io
+import shutil
+import subprocess
 import sys
 
 import torch
 from pages import write
+from PIL import Image
 
 from ifo_grounding import networks
 from ifo_grounding.evaluation import record_episodes
 from ifo_grounding.report import Captioned, animation, gallery
+from ifo_grounding.report.animation import gif
 from ifo_grounding.report.theme import GOOD
 from ifo_grounding.tasks import TASKS, VOCABULARY, SceneOptions, SceneStream
 from ifo_grounding.training import Run
@@ -45,8 +50,44 @@ def before_and_after(run: Run) -> bytes:
     return animation(both, titles=titles, columns=SCENES, width=180)
 
 
+def page_at_work(run: Run, sentence: str = "move to the yellow triangle") -> bytes:
+    """Type a sentence into the page, and let the agent follow it."""
+    from playwright.sync_api import sync_playwright
+
+    words = ["play", f"run={run.name}", "port=7899", "browser=false"]
+    served = subprocess.Popen([sys.executable, "-m", "ifo_grounding", *words], stdout=-1, text=True)
+    shots: list[bytes] = []
+    try:
+        assert served.stdout is not None and served.stdout.readline().startswith("http")
+        with sync_playwright() as playwright:
+            program = shutil.which("chromium") or shutil.which("chromium-browser")
+            browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": 1200, "height": 1190})
+            page.goto("http://127.0.0.1:7899")
+            page.locator("#completions button").first.wait_for()
+            page.locator("#sentence textarea").fill("")
+            for letter in sentence:
+                page.locator("#sentence textarea").press_sequentially(letter)
+                shots.append(page.screenshot())
+            page.get_by_role("button", name="Tell", exact=True).click()
+            for step in range(9):
+                page.wait_for_timeout(1000)
+                if not page.get_by_text(f"step {step} of").count():
+                    break
+                shots += 4 * [page.screenshot()]
+                page.get_by_role("button", name="Step", exact=True).click()
+            browser.close()
+    finally:
+        served.terminate()
+    return gif(
+        [Image.open(io.BytesIO(shot)).convert("RGB").resize((800, 793)) for shot in shots], 8
+    )
+
+
 if __name__ == "__main__":
     if len(sys.argv) != 2:
         raise SystemExit("usage: python docs/make_assets.py RUN")
-    pictures = {"world.png": world(), "before-after.gif": before_and_after(Run(sys.argv[1]))}
+    run = Run(sys.argv[1])
+    pictures = {"world.png": world(), "before-after.gif": before_and_after(run)}
+    pictures["playground.gif"] = page_at_work(run)
     write({}, pictures)

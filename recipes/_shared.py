@@ -38,9 +38,13 @@ REFERENCE = "reference-true-actions.safetensors"
 CLASSIFIER = "instruction.safetensors"
 REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
+VALUE = "value.safetensors"
 CHECKSUMS = "networks.json"
 """Of the networks that the run has trained, by file."""
-OF_PHASE_2 = ("self_examine", "continue_imitation", "evaluate", POLICIES["phase2"], CONTINUED)
+OF_PHASE_2 = (
+    *("self_examine", "continue_imitation", "evaluate"),
+    *(POLICIES["phase2"], CONTINUED, VALUE),
+)
 """Stages and networks that a run makes anew where it takes over another's phase 1."""
 CHOSEN_ANEW = (
     *("self_examine", "controls", "preset", "budget"),

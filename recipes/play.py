@@ -1,29 +1,37 @@
-"""One scene and one sentence: what a trained policy does, and what was learned thinks of it.
+"""A page on which one watches a trained agent, talks to it and teaches it; or one scene as a GIF.
 
-python recipes/play.py task=move scene=7 sentence="move to the red circle"
+python recipes/play.py run=move-strong-demo-seed0
+python recipes/play.py to=play.gif scene=7 sentence="move to the red diamond"
 """
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
-from _shared import CLASSIFIER, GOAL, POLICIES, load_network, world_of
+from _shared import (
+    CLASSIFIER,
+    GOAL,
+    INVERSE,
+    POLICIES,
+    VALUE,
+    load_demonstrations,
+    load_network,
+    world_of,
+)
 from hydra.core.config_store import ConfigStore
-from tensordict import TensorDict
 
-from ifo_grounding import keys
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.errors import UserError, check_choice, check_range
-from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.files import atomic_write
-from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import from_pretrained
+from ifo_grounding.networks.hub import OWN
 from ifo_grounding.options import options_of
-from ifo_grounding.seeding import STREAMS
-from ifo_grounding.tasks import TASKS
+from ifo_grounding.playground import Agent, Source
+from ifo_grounding.tasks import TASKS, grammar
+from ifo_grounding.texts import one_line
 from ifo_grounding.training import Run
-from ifo_grounding.worlds import World
 
 
 @dataclass
@@ -35,94 +43,99 @@ class PlayOptions:
     ``pick-out`` or ``pick-udlr``."""
     run: str | None = None
     """A run whose networks are played, in its world; null takes those of the package."""
+    host: str = "127.0.0.1"
+    """Address that the page listens on; another than this machine's own lets others in."""
+    port: int = 7860
+    """Port that the page listens on."""
+    browser: bool = True
+    """Whether the page is opened in a browser."""
+    to: str | None = None
+    """Instead of opening a page, plays one scene and writes an animation of it to this GIF."""
     scene: int = 0
-    """Number of the scene."""
+    """With ``to``: number of the scene."""
     sentence: str | None = None
-    """What is asked; null takes the scene's own instruction."""
-    stream: str = "evaluation"
-    """Scenes of ``evaluation``, ``validation`` or ``training``."""
+    """With ``to``: what is asked; null takes the scene's own instruction."""
     seed: int = 0
-    """Of the scenes."""
-    to: str | None = "play.gif"
-    """Animation that is written, step by step; null writes none."""
+    """With ``to``: seed of the scenes."""
 
     def __post_init__(self) -> None:
         check_choice("task", self.task, TASKS)
-        check_choice("stream", self.stream, STREAMS)
         check_range(self, "scene", "seed", least=0, most=2**31)
+        check_range(self, "port", least=1, most=65_535)
         if self.to is not None and Path(self.to).suffix.lower() != ".gif":
             raise UserError(f"to={self.to} is a GIF: give it a name that ends in .gif")
+        if self.to is None and (self.sentence is not None or self.scene or self.seed):
+            raise UserError("scene, sentence and seed are for one animation: give to=play.gif, too")
 
 
 ConfigStore.instance().store(name="play_options", node=PlayOptions)
 
 
 def play(options: PlayOptions) -> dict[str, Any]:
-    """Play the scene, and return what happened."""
-    networks, world = trained(options)
-    policy = networks["policy"]
-    env = world.instructed(1, seed=options.seed, stream=options.stream)
-    how: dict[str, Any] = {"seed": options.seed, "stream": options.stream}
-    (episode,) = record_episodes(policy, env, [options.scene], sentence=options.sentence, **how)
+    """Play one scene, and return what happened."""
+    agent = load(named(options))
+    *_, played = agent.play(options.scene, options.seed, options.sentence).values()
+    episode, actions = played.trace.episode, agent.world.actions
+    first = torch.from_numpy(episode.frames[0])
+    suited = agent.suits(episode.sentence, first, options.scene, options.seed)
     found: dict[str, Any] = {"scene": options.scene, "asked": episode.sentence}
-    frames = torch.from_numpy(episode.frames)
-    said = policy.vocabulary.encode([episode.sentence])
-    seen = {keys.PIXELS: frames[:1], keys.INSTRUCTION: said}
-    if "instruction" in networks:
-        found["suits, by the instruction classifier"] = asked(networks["instruction"], seen)
-    if world.oracle is not None:
-        found["suits, in truth"] = world.oracle.suits(said[0], options.scene, **how)
-    found["done"] = " ".join(world.actions[action] for action in episode.actions)
-    seen |= {keys.INITIAL_PIXELS: frames[:1], keys.PIXELS: frames[-1:]}
-    if "goal" in networks:
-        found["fulfilled, by the goal classifier"] = asked(networks["goal"], seen)
-    found["fulfilled, in truth"] = "yes" if episode.success else "no"
-    if options.to:
-        from ifo_grounding.report import trace_animation  # draws: slow to import
+    found["suits, by the instruction classifier"] = suited.probability
+    found["suits, in truth"] = suited.truth
+    found["done"] = " ".join(actions[action] for action in episode.actions)
+    found["fulfilled, by the goal classifier"] = played.fulfilled
+    if played.success is not None:
+        found["fulfilled, in truth"] = "yes" if played.success else "no"
+    from ifo_grounding.report import trace_animation  # draws: slow to import
 
-        trace = trace_episode(policy, episode, vocabulary=policy.vocabulary)
-        with atomic_write(options.to) as temporary:
-            temporary.write_bytes(trace_animation(trace, actions=world.actions))
-        found["step by step"] = options.to
-    return found
+    with atomic_write(str(options.to)) as temporary:
+        temporary.write_bytes(trace_animation(played.trace, actions=actions))
+    found["step by step"] = options.to
+    return {name: value for name, value in found.items() if value is not None}
 
 
-def trained(options: PlayOptions) -> tuple[dict[str, Any], World]:
-    """Return the networks that are played, and their world."""
-    if options.run is None:
-        kinds = ("policy", "instruction", "goal")
-        of = f"ifo-grounding/{options.task}"
-        world = world_of(options_of(f"task={options.task}"))
-        return {kind: from_pretrained(of, kind=kind) for kind in kinds}, world
-    run = Run(options.run)
+def named(options: PlayOptions) -> str:
+    """Return the name of the networks that are played."""
+    return options.run or f"{OWN}/{options.task}"
+
+
+@functools.lru_cache(maxsize=8)
+def load(name: str) -> Agent:
+    """Return the networks of the package, ``ifo-grounding/TASK``, or those of a run."""
+    if name.startswith(f"{OWN}/"):
+        own = {kind: from_pretrained(name, kind=kind) for kind in ("instruction", "goal", "policy")}
+        policies = {"self-examination": own.pop("policy")}
+        world = world_of(options_of(f"task={name.removeprefix(OWN + '/')}"))
+        return Agent(world, policies, grammar(world.task).tokens, **own)
+    run = Run(name)
     if run.options() is None:
-        raise UserError(
-            f"there is no run {options.run} ({run.folder}): ifo-grounding demo makes one"
-        )
-    made = options_of(f"run={options.run}")
-    files = {"policy": POLICIES["phase2"], "instruction": CLASSIFIER, "goal": GOAL}
-    if not (run / files["policy"]).exists():
-        files["policy"] = POLICIES["phase1"]
-    there = {kind: file for kind, file in files.items() if (run / file).exists()}
-    there["policy"] = files["policy"]
-    networks = {kind: load_network(run, file, "imitate", made) for kind, file in there.items()}
-    return networks, world_of(made)
+        raise UserError(f"there is no run {name} ({run.folder}): ifo-grounding demo makes one")
+    made = options_of(f"run={name}")
+    run.need(POLICIES["phase1"], "imitate")
 
+    def there(**files: str) -> dict[str, Any]:
+        found = {kind: file for kind, file in files.items() if (run / file).exists()}
+        return {kind: load_network(run, file, "imitate", made) for kind, file in found.items()}
 
-@torch.no_grad()
-def asked(network: Any, seen: dict[str, Any]) -> str:
-    """Return the probability that a classifier gives one frame, with its instruction."""
-    with evaluating(network):
-        logit = network(TensorDict(seen, [1]).select(*network.in_keys))[network.out_keys[0]]
-    return f"{float(logit.sigmoid()):.0%}"
+    phases = dict(zip(("imitation", "self-examination"), POLICIES.values(), strict=True))
+    others = there(instruction=CLASSIFIER, goal=GOAL, value=VALUE, inverse=INVERSE)
+    world = world_of(made)
+    return Agent(world, there(**phases), load_demonstrations(run).pool(), **others)
 
 
 @recipe_main
 def main(options: PlayOptions) -> None:
+    if options.to is None:
+        from ifo_grounding.playground.page import open_page
+
+        names = (named(options), *(f"{OWN}/{task}" for task in TASKS))
+        source = Source(load, tuple(dict.fromkeys(names)), local=options.host == "127.0.0.1")
+        open_page(source, options.host, options.port, options.browser)
+        return
     found = play(options)
     width = max(map(len, found))
     for name, value in found.items():
-        print(f"{name:<{width}}  {value}")
+        shown = f"{value:.0%}" if isinstance(value, float) else one_line(value)
+        print(f"{name:<{width}}  {shown}")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from _shared import (
     GOAL,
     POLICIES,
     REWARD,
+    VALUE,
     build,
     chosen_by,
     finish,
@@ -68,9 +69,10 @@ def examine(options: Options) -> dict:
         checkpoint=stage.checkpoint,
         checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
-        callback=audit_callback(policy, reward, run, options),
+        callback=audit_callback(policy, reward, run, options) if world_of(options).judged else None,
         progress=options.progress,
     )
+    save_network(run, VALUE, value)
     save_network(run, POLICIES["phase2"], policy)
     return finish(options, stage, history[-1], history)
 

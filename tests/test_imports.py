@@ -27,6 +27,7 @@ ORDER = (
     ("report",),
     ("worlds", "baselines"),
     ("config", "cli"),
+    ("playground",),
     ("options", "__main__"),
 )
 """The layers of the house: each imports those above it."""

@@ -62,6 +62,8 @@ def test_pictures_come_back_as_they_were_and_videos_at_twice_the_size(demos, tmp
     back = load_pictures(tmp_path / "shown", vocabulary=VOCABULARY)
     assert_same(back, demos)
     assert torch.equal(back.tokens, demos.tokens)
+    save_pictures(demos, tmp_path / "moving", kind="gif")
+    assert_same(load_pictures(tmp_path / "moving", vocabulary=VOCABULARY), demos)
     demos = demos[:2]
     save_pictures(demos, tmp_path / "filmed", kind="mp4", scale=2)
     back = load_pictures(tmp_path / "filmed", close=False)

@@ -12,7 +12,8 @@ from envs.stepping import assert_same, scenes
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
-from ifo_grounding.world import Layout, render
+from ifo_grounding.tasks import VOCABULARY
+from ifo_grounding.world import Layout, WorldState, render
 
 OBSERVED = {"pixels", "instruction", "done", "terminated", "truncated"}
 
@@ -152,6 +153,28 @@ def test_many_worlds_run_with_deterministic_algorithms():
     finally:
         torch.use_deterministic_algorithms(False)
     assert torch.equal(rollout["next", "pixels"][:, -1], render(env.truth.state))
+
+
+def test_worlds_begin_as_they_are_arranged():
+    env, learner = (PickAndPlaceEnv("move", 2, seed=0, instructed=on) for on in (True, False))
+    state = WorldState.empty(2)
+    state.objects[:, 1] = 1
+    start = env.reset(TensorDict({"state": state}, [2]))
+    assert torch.equal(start["pixels"], render(state))
+    asked = VOCABULARY.encode(["move to the red circle"] * 2)
+    env.reset(TensorDict({"state": state, "instruction": asked}, [2]))
+    for action, paid in ((1, 0.0), (5, 1.0)):
+        done = env.step(TensorDict({"action": torch.full([2], action)}, [2]))
+        assert (done["next", "reward"] == paid).all()
+    for name, value in (("arm", 36), ("objects", 13), ("boxes", 8)):
+        wrong = {**state.to_dict(), name: torch.full_like(getattr(state, name), value)}
+        with pytest.raises(UserError, match=f"{name} of a world holds {value}"):
+            env.reset(TensorDict({"state": wrong}, [2]))
+    with pytest.raises(UserError, match="objects of these worlds is"):
+        env.reset(TensorDict({"state": WorldState.empty(2, size=3)}, [2]))
+    first = learner.reset(TensorDict({"scene": torch.zeros(2, 1).long()}, [2]))
+    again = TensorDict({"scene": torch.zeros(2, 1).long(), "state": state}, [2])
+    assert torch.equal(learner.reset(again)["pixels"], first["pixels"])  # learners arrange nothing
 
 
 def test_who_steps_before_a_reset_is_told():

@@ -4,6 +4,7 @@ import shutil
 import sys
 
 import pytest
+import torch
 
 from envs import dial as dial_module
 from ifo_grounding import networks
@@ -11,6 +12,8 @@ from ifo_grounding.data import Demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
+from ifo_grounding.playground import Lesson
+from ifo_grounding.worlds import OpenGrid
 
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
 
@@ -50,6 +53,26 @@ def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
     policy = networks.load(tmp_path / "run" / "policy-phase2.safetensors")
     assert policy.network_config.shapes.n_actions == 3 and "dial" in policy.vocabulary.words
     assert world[0] == "world=gymnasium" or "dial" in report(given).read_text()
+
+
+def test_what_nobody_judges_is_trained_and_then_played(options, tmp_path, monkeypatch):
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path / "home"))
+    from play import load
+    from two_phase import two_phase
+
+    lesson = Lesson(OpenGrid(), seed=0)
+    for said, moves in (("go home", (0, 3)), ("walk away", (2, 1))) * 4:
+        for action in (*moves, *moves, OpenGrid().stop_action):
+            lesson.act(action, said)
+    lesson.save("demonstrations").rename(tmp_path / "shown")
+    own = ("world=own", "world._target_=ifo_grounding.worlds.OpenGrid", "task=mine")
+    assert two_phase(options(*own, f"recorded={tmp_path / 'shown'}")) == {}
+    agent = load(str(tmp_path / "run"))
+    assert sorted(agent.sentences) == ["go home", "walk away"]
+    for played in agent.play(0, 0, "walk away").values():
+        assert played.success is None and len(played.values) == len(played.states) - 1
+    frame = torch.from_numpy(played.trace.episode.frames[0])
+    assert agent.suits("go home", frame, 0, 0).truth is None
 
 
 @pytest.mark.parametrize(

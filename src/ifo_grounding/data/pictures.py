@@ -188,15 +188,16 @@ def save_pictures(
         demos: with a vocabulary.
         folder: where to, a new or an empty one; it appears when everything is written, and
             :func:`load_pictures` reads it.
-        kind: ``png``, a folder of frames per episode, without loss; or ``mp4``, a video of each,
-            with loss, with the extra ``video``.
+        kind: ``png``, a folder of frames per episode, without loss; ``gif``, an animation of each,
+            with loss where there are more than 256 colours; or ``mp4``, a video of each, with loss,
+            with the extra ``video``.
         scale: by which every pixel is enlarged.
 
     Raises:
         UserError: where the folder holds something, there is no demonstration or no vocabulary, the
             kind is unknown, or images do not fit it.
     """
-    check_choice("kind", kind, ("png", "mp4"))
+    check_choice("kind", kind, ("png", "gif", "mp4"))
     scale = at_least_one("scale", scale)
     sentences = written_sentences(demos, tuple(MODES) if kind == "png" else COLOURS)
     digits = len(str(len(demos) - 1))
@@ -210,6 +211,11 @@ def save_pictures(
             frames = rgb(demos[number]["pixels"]).repeat(scale, 1).repeat(scale, 2)
             if kind == "mp4":
                 write_video(temporary / f"{name}.mp4", frames, FRAMES_PER_SECOND)
+                continue
+            if kind == "gif":
+                first, *others = map(Image.fromarray, frames)
+                how: Any = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0}
+                first.save(temporary / f"{name}.gif", save_all=True, append_images=others, **how)
                 continue
             (temporary / name).mkdir()
             for step, frame in enumerate(frames):

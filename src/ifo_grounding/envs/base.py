@@ -78,12 +78,12 @@ class NumberedEnv(EnvBase):
             raise UserError("scene numbers start at 0")
         return mask, numbers
 
-    def _wish(self, tensordict: TensorDictBase | None) -> Tensor | None:
+    def _wish(self, tensordict: TensorDictBase | None, key: str = keys.INSTRUCTION) -> Any:
         """Return the instructions that a reset asks for; those of an observation are over."""
         given: Any = {} if tensordict is None else tensordict
         if not self.instructed or keys.PIXELS in given or "done" in given:
             return None
-        return given.get(keys.INSTRUCTION, None)
+        return given.get(key, None)
 
     def _check_instruction(self, given: Tensor | None, asked: Tensor) -> None:
         """Refuse another instruction than the episode's; on a GPU that would wait for it."""

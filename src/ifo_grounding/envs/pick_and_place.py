@@ -42,7 +42,7 @@ class PickAndPlaceEnv(NumberedEnv):
         instructed: whether scenes come with a suitable instruction. Without, there is no goal, no
             instruction and no reward.
         expose_state: whether the true state is in the tensordict, for tools other than learners:
-            adds ``("state", ...)`` entries, which are shown and never read.
+            adds ``("state", ...)`` entries.
         holdout: named list of colour-shape pairs that the split ``train`` does not mention.
         holdout_visible: whether these pairs are still seen in scenes of the split ``train``.
         stream: ``training``, ``validation`` or ``evaluation`` scenes.
@@ -53,8 +53,10 @@ class PickAndPlaceEnv(NumberedEnv):
         UserError: on an unknown name or an impossible size.
 
     A reset tensordict may hold ``"scene"``, int64 [*B, 1], the numbers of the scenes to begin with,
-    and, where it is no observation (``"pixels"``, ``"done"``), an ``"instruction"`` of the task,
-    int64 [*B, 16], in place of the scene's own. One that does not suit its scene is never rewarded.
+    and, where it is no observation (``"pixels"``, ``"done"``) and the worlds are instructed, an
+    ``"instruction"`` of the task, int64 [*B, 16], and a ``"state"``, a
+    :class:`~ifo_grounding.world.WorldState` [*B], in place of the scene's own. An instruction that
+    does not suit is never rewarded.
 
     >>> env = PickAndPlaceEnv("pick-out", num_envs=4, seed=0)
     >>> rollout = env.rollout(40, break_when_any_done=False)
@@ -162,10 +164,15 @@ class PickAndPlaceEnv(NumberedEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask, numbers = self._asked(tensordict)
         self._simulator.reset(mask, numbers)
-        if (tokens := self._wish(tensordict)) is not None:
+        tokens, arranged = self._wish(tensordict), self._wish(tensordict, STATE)
+        if tokens is not None or arranged is not None:
             every = torch.arange(self.num_envs, device=self.device)
             rows = every if mask is None else every[mask]
-            self._simulator.ask(rows, tokens[rows])
+            if arranged is not None:
+                self._simulator.arrange(rows, arranged[rows])
+            self._simulator.ask(
+                rows, (self._simulator.instruction if tokens is None else tokens)[rows]
+            )
         result = self._observe()
         for name in DONE:
             result[name] = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)

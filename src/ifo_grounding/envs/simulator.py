@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ifo_grounding import keys
-from ifo_grounding.errors import UserError, at_least_one, check_choice
+from ifo_grounding.errors import UserError, at_least_one, check_below, check_choice
 from ifo_grounding.tasks.goals import fulfilled, plan
 from ifo_grounding.tasks.grammar import grammar
 from ifo_grounding.tasks.scenes import FEWEST, Scene, SceneOptions, draw_scenes, leaves
 from ifo_grounding.tasks.streams import SceneStream
-from ifo_grounding.world import Canvas, WorldState, render, step
+from ifo_grounding.world import N_BOXES, N_KINDS, Canvas, WorldState, render, step
 from ifo_grounding.world.tiles import TILE_SIZES
 
 RENDER_TILE_SIZE = 32
@@ -81,10 +81,15 @@ class Simulator:
     @torch.inference_mode(False)
     def seed(self, seed: int) -> None:
         """Go to the first scene of the stream of this seed."""
-        self.stream = SceneStream(self.options, seed, self.device)
+        if not self._streams(seed):  # else it remembers what it has drawn
+            self.stream = SceneStream(self.options, seed, self.device)
         self._next = torch.zeros((), dtype=torch.int64, device=self.device)
         self._ahead: list[Tensor] = []
         self._drawn = self._most = 0
+
+    def _streams(self, seed: int) -> bool:
+        stream = getattr(self, "stream", None)
+        return stream is not None and (stream.seed, stream.options) == (seed, self.options)
 
     @torch.inference_mode(False)
     def to(self, device: torch.device | str) -> Simulator:
@@ -176,6 +181,23 @@ class Simulator:
                     leaf.index_copy_(0, part % count, rows)
             self._drawn = end
         self._most += self.num_envs
+
+    @torch.inference_mode(False)
+    def arrange(self, rows: Tensor, worlds: Any) -> None:
+        """Put worlds [R] with the entries of a :class:`WorldState` into rows that have just begun.
+
+        Raises:
+            UserError: where a world has another size, or things that there are not.
+        """
+        bounds = {"arm": self.state.objects.shape[-1] - 1, "held": N_KINDS}
+        for name, most in {**bounds, "objects": N_KINDS, "boxes": N_BOXES}.items():
+            leaf, new = getattr(self.state, name), worlds.get(name)
+            if new.shape != leaf[rows].shape:
+                raise UserError(
+                    f"{name} of these worlds is {list(leaf[rows].shape)}, not {list(new.shape)}"
+                )
+            check_below(f"{name} of a world holds", new, most + 1)
+            leaf.index_copy_(0, rows, new.to(leaf))
 
     @torch.inference_mode(False)
     def ask(self, rows: Tensor, tokens: Tensor) -> None:

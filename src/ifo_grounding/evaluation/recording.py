@@ -46,6 +46,7 @@ def record_episodes(
     scenes: Sequence[int] = range(8),
     *,
     sentence: str | None = None,
+    state: Any = None,
     render_tile_size: int | None = None,
     **options: Any,
 ) -> list[Episode]:
@@ -61,6 +62,8 @@ def record_episodes(
         scenes: numbers of the scenes; of other environments the first ones, ``range(n)``.
         sentence: what is asked in place of the scenes' own instructions, where the environment
             takes one, as the library's own world does.
+        state: worlds [N] to begin in, in place of the scenes' own: a
+            :class:`~ifo_grounding.world.WorldState`, in the library's own world.
         render_tile_size: size of a cell in the kept frames, for people (16 or 32), for a task's
             name; what the policy sees where None.
         options: of :func:`success_rate`, such as ``mode``, ``seed``, ``stream`` and ``max_steps``.
@@ -87,8 +90,8 @@ def record_episodes(
             raise UserError(
                 f"the environment has {rows} rows for {len(scenes)} scenes: make it with as many"
             )
-        if sentence is not None:
-            start = _asked(env, scenes, sentence)
+        if sentence is not None or state is not None:
+            start = _asked(env, scenes, sentence, state)
         frames.extend([frame] for frame in _seen(env, start.reshape(rows), render_tile_size))
         vocabulary: Vocabulary = attribute(env, "vocabulary", VOCABULARY)
         sentences.extend(vocabulary.decode(start.reshape(rows)[keys.INSTRUCTION].cpu()))
@@ -120,15 +123,20 @@ def record_episodes(
     ]
 
 
-def _asked(env: EnvBase, scenes: Sequence[int], sentence: str) -> TensorDictBase:
-    """Begin scenes anew with a sentence of one's own."""
+def _asked(env: EnvBase, scenes: Sequence[int], sentence: str | None, state: Any) -> TensorDictBase:
+    """Begin scenes anew with a sentence or worlds of one's own."""
     if not isinstance(env, NumberedEnv):
         raise UserError(f"{type(env).__name__} takes no sentence of one's own at its reset")
-    tokens = env.vocabulary.encode([sentence]).expand(len(scenes), -1)
-    numbers = torch.tensor([*scenes]).unsqueeze(-1)
-    asked = TensorDict({keys.SCENE: numbers, keys.INSTRUCTION: tokens}, env.batch_size)
+    if state is not None and not isinstance(env, PickAndPlaceEnv):
+        raise UserError(f"{type(env).__name__} cannot be arranged: it begins as it begins")
+    asked = TensorDict({keys.SCENE: torch.tensor([*scenes]).unsqueeze(-1)}, env.batch_size)
+    if state is not None:
+        asked["state"] = state
+    if sentence is None:
+        return env.reset(asked.to(env.device or "cpu"))
+    asked[keys.INSTRUCTION] = env.vocabulary.encode([sentence]).expand(len(scenes), -1)
     start = env.reset(asked.to(env.device or "cpu"))
-    if not torch.equal(start[keys.INSTRUCTION].cpu(), tokens):
+    if not torch.equal(start[keys.INSTRUCTION].cpu(), asked[keys.INSTRUCTION].cpu()):
         raise UserError(f"this world takes no sentence of one's own: {env.own_sentence}")
     return start
 

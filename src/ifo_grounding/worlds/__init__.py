@@ -5,7 +5,7 @@ A recipe knows :class:`World` alone, so that every recipe runs on every world.
 
 from ifo_grounding.worlds.babyai import BabyAI
 from ifo_grounding.worlds.base import Oracle, World
-from ifo_grounding.worlds.grid import Grid
+from ifo_grounding.worlds.grid import Grid, OpenGrid
 from ifo_grounding.worlds.gymnasium import Gymnasium
 
-__all__ = ["BabyAI", "Grid", "Gymnasium", "Oracle", "World"]
+__all__ = ["BabyAI", "Grid", "Gymnasium", "OpenGrid", "Oracle", "World"]

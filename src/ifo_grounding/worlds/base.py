@@ -28,8 +28,10 @@ class Oracle(Protocol):
     def endings(self, policy: nn.Module, episodes: int, **scenes: Any) -> Endings:
         """Say how the policy's episodes end."""
 
-    def suits(self, instruction: Tensor, scene: int, *, seed: int, stream: str) -> str:
-        """Say whether an instruction suits a scene, ``suitable``, or why not."""
+    def suits(
+        self, instruction: Tensor, scene: int, *, seed: int, stream: str, state: Any = None
+    ) -> str:
+        """Say whether an instruction suits a scene or a state, ``suitable``, or why not."""
 
     def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
         """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
@@ -48,12 +50,15 @@ class World(ABC):
         vocabulary: the words of instructions; None until the demonstrations tell them, which
             recipes then set.
         oracle: what knows the truth; None where nobody does.
+        judged: whether instructed worlds pay success. Without, nothing is evaluated: a person looks
+            at what was learned (``ifo-grounding play``).
     """
 
     actions: Sequence[str] = ()
     stop_action: int | None = None
     vocabulary: Vocabulary | None = None
     oracle: Oracle | None = None
+    judged: bool = True
 
     @abstractmethod
     def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> EnvBase:
@@ -116,6 +121,15 @@ class World(ABC):
         """
         raise UserError(f"{type(self).__name__} has no demonstrator to compare with")
 
+    @staticmethod
+    def recorded(folder: Path, **options: Any) -> Demonstrations:
+        """Read a folder of pictures or of LeRobot, or what ``Demonstrations.save`` wrote."""
+        if (folder / LIST).exists():
+            return load_pictures(folder, **options)
+        if (folder / INFO).exists():
+            return load_lerobot(folder, **options)
+        return Demonstrations.load(folder)
+
     def read(self, folder: str | Path, progress: bool = False) -> Demonstrations:
         """Read demonstrations that were recorded elsewhere.
 
@@ -125,13 +139,9 @@ class World(ABC):
         folder = Path(folder)
         if not folder.is_dir():
             raise UserError(f"recorded={folder} is no folder of demonstrations")
-        if (folder / LIST).exists():
-            demos = load_pictures(folder, vocabulary=self.vocabulary, progress=progress)
-        elif (folder / INFO).exists():
-            demos = load_lerobot(folder, vocabulary=self.vocabulary, progress=progress)
-        else:
-            demos = Demonstrations.load(folder)
-            demos = demos if demos.cut.any() else demos.close_episodes()
+        demos = self.recorded(folder, vocabulary=self.vocabulary, progress=progress)
+        if not demos.cut.any():
+            demos = demos.close_episodes()
         if self.vocabulary is None:
             self.vocabulary = demos.vocabulary
         elif demos.vocabulary != self.vocabulary:

@@ -106,15 +106,37 @@ class Grid(World):
         options = self.scenes(episodes=episodes, **scenes)
         return episode_endings(policy, self.task, **options)
 
-    def suits(self, instruction: Tensor, scene: int, *, seed: int, stream: str) -> str:
-        """Say whether an instruction suits a scene, ``suitable``, or why not."""
-        env = self.instructed(1, seed=seed, stream=stream)
-        env.reset(TensorDict({keys.SCENE: torch.tensor([[scene]])}, [1]))
+    def suits(
+        self, instruction: Tensor, scene: int, *, seed: int, stream: str, state: Any = None
+    ) -> str:
+        """Say whether an instruction suits a scene or a state, ``suitable``, or why not."""
+        if state is None:
+            env = self.instructed(1, seed=seed, stream=stream)
+            env.reset(TensorDict({keys.SCENE: torch.tensor([[scene]])}, [1]))
+            state = env.truth.state
         goal = grammar(self.task).parse_tokens(instruction.reshape(1, -1))
-        return REASONS[int(verdict(env.truth.state, goal))]
+        return REASONS[int(verdict(state, goal))]
 
     def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
         """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
         from ifo_grounding.report import instruction_cases  # draws: slow to import
 
         return instruction_cases(classifier, self.task, pool, **self.scenes(**options))
+
+
+@dataclass
+class OpenGrid(World):
+    """The same grid with sentences of a person's own, of which nobody knows what fulfils them."""
+
+    judged = False
+
+    def __post_init__(self) -> None:
+        self.actions, self.stop_action = keys.ACTIONS, keys.STOP
+
+    def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
+        """Return worlds without instructions; see :class:`World`."""
+        return Grid("move").simulator(num_envs, **options)
+
+    def instructed(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
+        """Return worlds to play in, whose instructions and rewards are those of another task."""
+        return Grid("move").instructed(num_envs, **options)
