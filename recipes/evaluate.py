@@ -23,6 +23,7 @@ from _shared import (
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
+from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import (
     SuccessResult,
     compare_endings,
@@ -85,8 +86,12 @@ def measured_success(policies: dict[str, Any], options: Options) -> dict[str, Su
 
 def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[str, Any]]:
     """Return the instructed world of the evaluation scenes, and how to play it."""
-    scenes = {**evaluation_scenes(options), **chosen}
-    env = world_of(options).instructed(min(episodes, ROWS), device=options.device, **scenes)
+    scenes, world = {**evaluation_scenes(options), **chosen}, world_of(options)
+    if not world.judged:
+        raise UserError(
+            f"nobody knows success in this world: ifo-grounding play run={options.run} shows it"
+        )
+    env = world.instructed(min(episodes, ROWS), device=options.device, **scenes)
     how: dict[str, Any] = {"seed": scenes["seed"], "stream": scenes["stream"]}
     return env, {
         "episodes": episodes,

@@ -57,6 +57,7 @@ def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
 
 def test_what_nobody_judges_is_trained_and_then_played(options, tmp_path, monkeypatch):
     monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path / "home"))
+    from evaluate import evaluate
     from play import load
     from two_phase import two_phase
 
@@ -66,7 +67,10 @@ def test_what_nobody_judges_is_trained_and_then_played(options, tmp_path, monkey
             lesson.act(action, said)
     lesson.save("demonstrations").rename(tmp_path / "shown")
     own = ("world=own", "world._target_=ifo_grounding.worlds.OpenGrid", "task=mine")
-    assert two_phase(options(*own, f"recorded={tmp_path / 'shown'}")) == {}
+    given = options(*own, f"recorded={tmp_path / 'shown'}")
+    assert two_phase(given) == {}
+    with pytest.raises(UserError, match="nobody knows success in this world"):
+        evaluate(given)
     agent = load(str(tmp_path / "run"))
     assert sorted(agent.sentences) == ["go home", "walk away"]
     for played in agent.play(0, 0, "walk away").values():

@@ -25,9 +25,10 @@ def open_page(source: Source, host: str = LOCAL, port: int = 7860, browser: bool
         browser: whether to open it in a browser.
 
     Raises:
-        UserError: where the port is taken, the address is none of this machine's, or the extra
-            ``play`` is not installed.
+        UserError: where the port is taken, the address is none of this machine's, or the networks
+            cannot be loaded.
     """
+    source.load(source.names[0])  # what is wrong with it is said before a page opens
     page = build_page(source)
     with socket.socket() as trial:
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
