@@ -46,7 +46,7 @@ def before_and_after(run: Run) -> bytes:
         tries.append(record_episodes(policy, task, range(TRIED), **shown))
     pairs = [pair for pair in zip(*tries, strict=True) if pair[1].success > pair[0].success]
     both = [episode for phase in zip(*pairs[:SCENES], strict=True) for episode in phase]
-    titles = [title for title in ("imitation", "after practice") for _ in range(SCENES)]
+    titles = [title for title in ("imitation", "after self-examination") for _ in range(SCENES)]
     return animation(both, titles=titles, columns=SCENES, width=180)
 
 

@@ -65,7 +65,8 @@ def watch_tab(source: Source, visit: Any) -> Tab:
         speed = gradio.Slider(0.5, 8, 2, step=0.5, label="Steps a second")
         looks = gradio.Checkbox(False, label="Where it looks")
     boards = gradio.HTML(js_on_load=drawing.EVENTS, elem_id="boards")
-    with gradio.Accordion("Arrange the scene: choose a thing, then click on a cell", open=False):
+    arranging = "Arrange the scene: choose a thing, then click on a cell"
+    with gradio.Accordion(arranging, open=False) as arrange:
         tool = gradio.Radio(list(TOOLS), value=LOOK, label="Put", elem_id="tool")
         undo = gradio.Button("As it was")
     timer = gradio.Timer(0.5, active=False)
@@ -84,7 +85,6 @@ def watch_tab(source: Source, visit: Any) -> Tab:
     def draw(visit: Visit) -> list[Any]:
         said = visit.said if visit.sentence is None else visit.sentence
         offered = gradio.Dataset(samples=[[each] for each in visit.agent.complete("", visit.frame)])
-        arranges = visit.agent.arranges
         return [
             gradio.Dropdown(choices=visit.names, value=visit.name),
             visit.scene,
@@ -93,16 +93,17 @@ def watch_tab(source: Source, visit: Any) -> Tab:
             offered,
             wrong(visit) or _suits(visit, said),
             *step_drawn(visit),
-            gradio.Radio(visible=arranges),
+            gradio.Accordion(visible=visit.agent.arranges),
             gradio.Button("Play"),
             gradio.Timer(active=False),
         ]
 
-    shown = [name, scene, seed, sentence, completions, status, at, boards, tool, play, timer]
+    shown = [name, scene, seed, sentence, completions, status, at, boards, arrange, play, timer]
     moved = [at, boards]
-    on = lambda event, action, *given: event(  # noqa: E731
-        does(action, draw), [visit, *given], shown, **quiet
-    )
+
+    def on(event: Any, action: Callable[..., Any], *given: Any) -> None:
+        event(does(action, draw), [visit, *given], shown, **quiet)
+
     on(name.input, Visit.choose, name)
     on(scene.submit, Visit.go, scene, seed)
     on(seed.submit, Visit.go, scene, seed)

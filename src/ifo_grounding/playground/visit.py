@@ -59,16 +59,27 @@ class Visit:
     wrong: str = ""
     """What was wrong with the last thing that was asked for, empty where nothing was."""
     name: str = ""
+    """Of the agent that is watched."""
     scene: int = 0
+    """Number of the scene."""
     seed: int = 0
+    """Of the scenes."""
     sentence: str | None = None
+    """What the person said; None for the scene's own instruction."""
     state: WorldState | None = None
+    """How the person arranged the scene, [1]."""
     at: int = 0
+    """Step that is seen."""
     tool: str = LOOK
+    """What a click on a cell does, one of :data:`TOOLS`."""
     looks: bool = False
+    """Whether it is shown where the policy looks."""
     recording: Demonstrations | None = None
+    """Demonstrations that are looked at."""
     rows: list[Recorded] = field(default_factory=list)
+    """The same, those first that look wrong."""
     row: int | None = None
+    """Place in ``rows`` of the one that is seen."""
 
     def __post_init__(self) -> None:
         self.choose(self.source.names[0])
