@@ -29,7 +29,6 @@ from _shared import (
 )
 from evaluate import measured_success, played, success_results
 from imitate import imitate_transitions, split_transitions
-from references import imitate_truth
 from self_examine import chosen_starts
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import RandomPolicy
@@ -121,6 +120,29 @@ def trained(options: Options) -> Any:
         run = open_run(options)
     known = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
     return load_network(run, known.get(method, file_of(method)), "baselines", options)
+
+
+def imitate_truth(options: Options) -> dict:
+    """Imitate as phase 1 does, with the demonstrator's actions in place of labels."""
+    stage = open_stage(options, "imitate_truth")
+    if stage.result is not None:
+        return stage.result
+    if not (stage.run / TRUTH).exists():
+        raise UserError(
+            f"{stage.run / TRUTH} is missing: demonstrations that were recorded elsewhere hold no "
+            "actions to imitate"
+        )
+    demos, truth = load_demonstrations(stage.run), Truth.load(stage.run / TRUTH)
+    seen, held_out = split_transitions(demos, truth.actions, options.imitate.held_out)
+    return imitate_transitions(options, stage, seen, held_out, REFERENCE)
+
+
+def references(options: Options) -> dict[str, Any]:
+    """Return what phase 1 is compared with: imitation of true actions, and the demonstrator."""
+    methods = {"true_actions": "bc", "demonstrator": "expert"}
+    return {
+        name: baseline(replace(options, method=method))[method] for name, method in methods.items()
+    }
 
 
 def file_of(method: str) -> str:

@@ -32,7 +32,7 @@ from ifo_grounding.evaluation import (
     reward_audit,
     success_rate,
 )
-from ifo_grounding.report import results_table
+from ifo_grounding.report import results_rows, text_table
 from ifo_grounding.report.results import by_scene
 from ifo_grounding.training import Run
 from ifo_grounding.transforms import GoalReward, LearnedReward
@@ -206,7 +206,7 @@ def main(options: Options) -> dict:
     results = evaluate(options)
     if options.results:
         write_result(options, results, "evaluate")
-    print(results_table(results))
+    print(text_table(results_rows(results)))
     return results
 
 

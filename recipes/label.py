@@ -17,7 +17,7 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
 from ifo_grounding.data import Truth, label_demonstrations
 from ifo_grounding.evaluation import label_accuracy
-from ifo_grounding.report import results_table, text_table
+from ifo_grounding.report import results_rows, text_table
 
 
 def label(options: Options) -> dict:
@@ -41,7 +41,7 @@ def label(options: Options) -> dict:
 def main(options: Options) -> None:
     found = label(options)
     if "accuracy" in found:
-        print(results_table({"labels": found["accuracy"]}))
+        print(text_table(results_rows({"labels": found["accuracy"]})))
     else:
         names = world_of(options).actions
         rows = [{**row, "action": names[row["action"]]} for row in found["confidence"]]

@@ -24,6 +24,7 @@ from ifo_grounding.evaluation import record_episodes, trace_episode
 from ifo_grounding.files import read_record
 from ifo_grounding.report import (
     animation,
+    instruction_cases,
     provenance,
     reliability_diagram,
     results_rows,
@@ -81,15 +82,12 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     pictures: dict[str, Any] = episode_pictures(run, options, results)
     if "suitability" in results:
         classifier = load_network(run, CLASSIFIER, "train_instruction", options)
-        oracle = world_of(options).oracle
+        oracle, pool = world_of(options).oracle, load_demonstrations(run).pool()
         assert oracle is not None
-        pictures["Chosen instructions"] = oracle.instruction_cases(
-            classifier,
-            load_demonstrations(run).pool(),
-            split=options.evaluate.split,
-            stream="validation",
-            **chosen_by(options),
-        )
+        shown: Any = {"states": 512, "pairs_per_state": 0, "stream": "validation"}
+        shown |= {"split": options.evaluate.split, **chosen_by(options)}
+        chosen = oracle.suitable_rate(classifier, pool, **shown)
+        pictures["Chosen instructions"] = instruction_cases(chosen, pool)
         pictures["How often random pairs are suitable, against what is said"] = reliability_diagram(
             [(said, restored(Rate, rate)) for said, rate in results["suitability"]["reliability"]]
         )

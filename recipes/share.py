@@ -2,16 +2,7 @@
 
 from pathlib import Path
 
-from _shared import (
-    CLASSIFIER,
-    GOAL,
-    INVERSE,
-    POLICIES,
-    REWARD,
-    load_demonstrations,
-    load_network,
-    open_run,
-)
+from _shared import CLASSIFIER, GOAL, INVERSE, POLICIES, REWARD, load_network, open_run
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
@@ -32,17 +23,14 @@ FILES = {
 
 def share(options: Options) -> list[Path]:
     run = open_run(options, "share")
-    words, facts = load_demonstrations(run).vocabulary, card_facts(run, options)
-    written = []
+    facts, written = card_facts(run, options), []
     for name, files in FILES.items():
         there = [file for file in files if (run / file).exists()]
         if there:
             network = load_network(run, there[0], "two_phase", options)
             hub_id = f"{options.hub}-{name}" if options.hub else None
             folder = Path(options.to) / name
-            written.append(
-                save_pretrained(network, folder, vocabulary=words, facts=facts, hub_id=hub_id)
-            )
+            written.append(save_pretrained(network, folder, facts=facts, hub_id=hub_id))
     return written
 
 

@@ -13,7 +13,6 @@ from evaluate import evaluate
 from imitate import imitate
 from label import label
 from record_demonstrations import record
-from references import references
 from self_examine import examine
 from train_goal import train_goal
 from train_instruction import train_instruction
@@ -49,6 +48,8 @@ def two_phase(options: Options) -> dict:
         continue_imitation(options)
     results = evaluate(options)
     if options.references:
+        from baselines import references  # which begin with the stages below
+
         results = {**results, **references(options)}
     write_result(options, results, "demo")
     return results

@@ -84,9 +84,9 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ("demoo", "unknown command 'demoo' (did you mean 'demo'?): choose one of demo, "),
+        ("demoo", "unknown command 'demoo' (did you mean 'demo'?): choose one of 'demo', "),
         ("run", "which recipe? choose one of greet"),
-        ("run great", "unknown recipe 'great' (did you mean 'greet'?): choose one of greet"),
+        ("run great", "unknown recipe 'great' (did you mean 'greet'?): choose one of 'greet'"),
         ("run greet tsk=move", "unknown option 'tsk' (did you mean 'task'?): there are "),
         ("run greet --resolve", "lexernoviablealtexception"),
         ("run greet task=fly", "unknown task 'fly': choose move or pick"),

@@ -73,7 +73,7 @@ def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
     demos = demos[torch.nonzero((demos.tokens[:, None] == pool).all(-1).any(-1)).squeeze(1)]
 
     def losses(device):
-        options = {"seed": 0, "device": device, "precision": "fp32"}
+        options = {"seed": 0, "device": device}
         if kind == "goal":
             loss = GoalLoss(
                 networks.make_goal_classifier(demos, "paper", **options), pool, negatives=1

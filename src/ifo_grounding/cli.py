@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ifo_grounding.errors import UserError, did_you_mean
+from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.texts import one_line
 
 USAGE_ERROR, INTERRUPTED, CLOSED = 2, 130, 141
@@ -122,13 +122,12 @@ def resolve(command: str, rest: Sequence[str]) -> tuple[str, list[str]]:
     if command in COMMANDS:
         return COMMANDS[command][0], options
     if command != "run":
-        raise UserError(_unknown("command", command, [*COMMANDS, "run"]))
+        check_choice("command", command, [*COMMANDS, "run"])
     names = recipe_names()
     if not options:
         raise UserError(f"which recipe? choose one of {', '.join(names)}")
     recipe = options.pop(0).removesuffix(".py")
-    if recipe not in names:
-        raise UserError(_unknown("recipe", recipe, names))
+    check_choice("recipe", recipe, names)
     return recipe, options
 
 
@@ -160,11 +159,6 @@ def recipes_folder() -> Path:
 def recipe_names() -> list[str]:
     """Return the names of all recipes, sorted."""
     return sorted(path.stem for path in recipes_folder().glob("[!_]*.py"))
-
-
-def _unknown(what: str, given: str, allowed: Sequence[str]) -> str:
-    hint = did_you_mean(given, allowed)
-    return f"unknown {what} {given!r}{hint}: choose one of {', '.join(allowed)}"
 
 
 if __name__ == "__main__":

@@ -58,8 +58,6 @@ def play(
         env: a batched environment, just reset.
         start: what its reset returned.
         mode: ``greedy`` or ``sampled``.
-        max_steps: most actions per episode.
-        on_step: see :data:`OnStep`.
 
     Raises:
         UserError: where the policy writes no action, or none of the environment's.

@@ -30,8 +30,9 @@ def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     """
     options = list(allowed)
     if value not in options:
+        hint = did_you_mean(str(value), [each for each in options if isinstance(each, str)])
         listed = ", ".join(repr(option) for option in options)
-        raise UserError(f"unknown {name} {value!r}: choose one of {listed}")
+        raise UserError(f"unknown {name} {value!r}{hint}: choose one of {listed}")
 
 
 def whole(name: str, value: object) -> int:
@@ -51,17 +52,18 @@ def at_least_one(name: str, value: object) -> int:
     return number
 
 
-def share(name: str, value: Any) -> float:
-    """Return a share or a probability, or refuse what is no number within 0..1.
+def share(name: str, value: Any, full: bool = True) -> float:
+    """Return a share or a probability, or refuse what is no number within 0..1, or ``full``.
 
     >>> share("fraction", 1.5)
     Traceback (most recent call last):
     ifo_grounding.errors.UserError: fraction must be within 0..1, got 1.5
     """
     with contextlib.suppress(TypeError, ValueError, RuntimeError):  # no number, or several
-        if not isinstance(value, str | bytes) and 0 <= (number := float(value)) <= 1:
+        number = math.nan if isinstance(value, str | bytes) else float(value)
+        if 0 <= number <= 1 and (full or number < 1):
             return number
-    raise UserError(f"{name} must be within 0..1, got {value!r:.40}")
+    raise UserError(f"{name} must be within 0..1{'' if full else ', below 1'}, got {value!r:.40}")
 
 
 def check_below(what: str, values: Any, count: int) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 PIXELS = "pixels"
 """Image of the world, uint8 [*B, 3, H, W]."""
 INSTRUCTION = "instruction"
@@ -37,12 +35,3 @@ N_ACTIONS = len(ACTIONS)
 STOP = ACTIONS.index("S")
 INSTRUCTION_LENGTH = 16
 """Tokens per instruction, padding included."""
-
-
-def action_names(count: int) -> Sequence[str]:
-    """Return the grid's names where there are as many actions as it has, else their numbers.
-
-    >>> action_names(3)
-    ['0', '1', '2']
-    """
-    return ACTIONS if count == N_ACTIONS else [*map(str, range(count))]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -111,6 +112,38 @@ def beside(batch: TensorDictBase, module: object) -> TensorDictBase:
     """
     device = device_of(module)
     return batch if device is None or device.type == "cpu" else batch.to(device)
+
+
+class WholePairs:
+    """A module of whole pairs, to be asked as one that encodes images and instructions apart."""
+
+    def __init__(self, module: TensorDictModuleBase, output: NestedKey) -> None:
+        self.module, self.output = module, output
+
+    def encode_scenes(self, *pixels: Tensor) -> TensorDict:
+        """Return images, each [N, C, H, W], by their names."""
+        return TensorDict(dict(zip(self.module.in_keys, pixels, strict=False)), [len(pixels[0])])
+
+    def encode_instruction(self, tokens: Tensor) -> Tensor:
+        """Return token ids [P, L] as they are."""
+        return tokens
+
+    def score_candidates(self, scenes: TensorDict, words: Tensor, index: Tensor) -> Tensor:
+        """Score some instructions, index [N, K], of each scene: logits [N * K, 1]."""
+        rows = torch.arange(len(index), device=index.device).repeat_interleave(index.shape[1])
+        pairs = scenes[rows].set(self.module.in_keys[-1], words[index.flatten()])
+        return self.module(pairs).get(self.output)
+
+
+def halves_of(module: TensorDictModuleBase, output: NestedKey) -> Any:
+    """Return what scores images, each encoded once, with instructions, each encoded once.
+
+    That is the module itself where it has ``encode_scenes``, ``encode_instruction`` and
+    ``score_candidates``; any other is called on whole pairs: images first, the instruction last.
+    """
+    parts = ("encode_scenes", "encode_instruction", "score_candidates")
+    split = all(hasattr(module, part) for part in parts)
+    return module if split else WholePairs(module, output)
 
 
 def has_word_penalty(module: nn.Module) -> bool:

@@ -24,8 +24,10 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from ifo_grounding.cli import recipes_folder
 from ifo_grounding.config import FREE, Options
 from ifo_grounding.data import Demonstrations
+from ifo_grounding.data.lerobot import INFO
 from ifo_grounding.data.pictures import LIST, read_list
 from ifo_grounding.errors import UserError, did_you_mean
+from ifo_grounding.files import read_json
 from ifo_grounding.training.checkpoint import leaves
 from ifo_grounding.training.run import Run
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
@@ -85,7 +87,7 @@ def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
         jobs = [words] if len(words) == len(arguments) else _combinations(words)
         if own:
             texts = texts_of(OmegaConf.get_type(compose(script.stem)))
-            given = [[_text(word, texts) for word in job] for job in jobs]
+            given = [[quoted(word, texts, comma="text") for word in job] for job in jobs]
             return [OmegaConf.to_object(compose(script.stem, job)) for job in given]
         return [_settled(job) for job in jobs]
 
@@ -102,33 +104,28 @@ def _composing(recipes: Path) -> Iterator[None]:
         raise explained(error) from None
 
 
-def quoted(word: str, several: bool = False) -> str:
+def quoted(word: str, texts: Mapping[str, str] = TEXTS, comma: str = "unclear") -> str:
     """Return an option that is a text as Hydra takes it, whatever is in its value.
 
-    References stay, what is quoted already, null, and a comma that parts values, or may mean to.
+    What is quoted already stays, and null. A comma is part of the ``text``, such as a sentence, or
+    ``parts`` values; an ``unclear`` one stays, too, and so do references, unless all is text.
 
     >>> quoted("run=2024_11_27 #1")
     "run='2024_11_27 #1'"
     """
     name, _, value = word.partition("=")
-    values = value.split(",")
-    as_it_is = "${" in value or value[:1] + value[1:][-1:] in ("''", '""')
-    as_it_is |= bool(re.match(r"\w+\(", value)) if several else len(values) > 1
-    if as_it_is or value in ("", TEXTS.get(name, value)):
-        return word
-    return f"{name}={','.join(map(_quote, values))}"
-
-
-def _text(word: str, texts: Mapping[str, str]) -> str:
-    """Return an option of a recipe of its own: commas are part of a text, such as a sentence."""
-    name, _, value = word.partition("=")
     as_it_is = value[:1] + value[1:][-1:] in ("''", '""') or value in ("", texts.get(name, value))
-    return word if as_it_is else f"{name}={_quote(value)}"
-
-
-def _quote(value: str) -> str:
-    path = str(Path(value).expanduser()) if value.startswith("~/") else value
-    return "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", r"\'"), path) + "'"
+    if comma != "text":
+        calls = re.match(r"\w+\(", value) if comma == "parts" else "," in value
+        as_it_is |= "${" in value or bool(calls)
+    if as_it_is:
+        return word
+    escaped = []
+    for part in value.split(",") if comma == "parts" else [value]:
+        text = str(Path(part).expanduser()) if part.startswith("~/") else part
+        quotes = re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", r"\'"), text)
+        escaped.append(f"'{quotes}'")
+    return f"{name}={','.join(escaped)}"
 
 
 def _combinations(words: Sequence[str]) -> list[list[str]]:
@@ -137,7 +134,9 @@ def _combinations(words: Sequence[str]) -> list[list[str]]:
         [f"{each.get_key_element()}={value}" for value in each.sweep_string_iterator()]
         if each.is_sweep_override()
         else [str(each.input_line)]
-        for each in OverridesParser.create().parse_overrides([quoted(w, True) for w in words])
+        for each in OverridesParser.create().parse_overrides(
+            [quoted(w, comma="parts") for w in words]
+        )
     ]
     return [[*job] for job in itertools.product(*given)]
 
@@ -171,6 +170,8 @@ def _demonstrations(cfg: DictConfig) -> int:
     folder = Path(cfg.recorded)
     if not folder.is_dir():
         raise UserError(f"recorded={folder} is no folder of demonstrations")
+    if (folder / INFO).exists():
+        return min(asked, read_json(folder / INFO, dict, ["total_episodes"])["total_episodes"])
     recorded = read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder)
     return min(asked, len(recorded))
 

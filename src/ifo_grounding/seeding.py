@@ -24,11 +24,9 @@ def derive(seed: int, *names: object) -> int:
     return int.from_bytes(digest, "little") >> 1
 
 
-def generator(
-    seed: int, *names: object, device: torch.device | str | None = None
-) -> torch.Generator:
-    """Return a generator on ``device`` seeded with :func:`derive`."""
-    return torch.Generator(device=device or "cpu").manual_seed(derive(seed, *names))
+def generator(seed: int, *names: object) -> torch.Generator:
+    """Return a generator on the CPU, seeded with :func:`derive`."""
+    return torch.Generator().manual_seed(derive(seed, *names))
 
 
 def _signed(bits: int) -> int:

@@ -98,7 +98,7 @@ def test_the_bot_plays_the_rooms_of_the_environment():
 
 
 def test_what_cannot_be_recorded_is_refused():
-    with pytest.raises(UserError, match=r"no level 'BabyAI-GoToMoon-v0'.*GoToLocal"):
+    with pytest.raises(UserError, match=r"unknown level 'GoToMoon'.*GoToLocal"):
         babyai("GoToMoon")
     with pytest.raises(UserError, match="at least 1"):
         record_babyai("GoToObj", 0)

@@ -93,19 +93,9 @@ def test_transitions_are_located_episode_by_episode(demos):
     episode, frame = demos.locate()
     assert episode.tolist() == [0, 0, 2, 2, 2, 2, 3]
     assert frame.tolist() == [0, 1, 4, 5, 6, 7, 9]
-    episode, frame = demos[[3, 1, 0]].locate(torch.tensor([2, 0, 1]))
-    assert episode.tolist() == [2, 0, 2]
-    assert frame.tolist() == [1, 9, 0]
-
-
-def test_a_split_sets_episodes_aside():
-    demos = numbered()
-    rest, aside = demos.split(0.2, seed=1)
-    assert (len(rest), len(aside)) == (40, 10)
-    together = torch.cat([rest.instructions, aside.instructions]).flatten()
-    assert sorted(together.tolist()) == list(range(50))
-    assert torch.equal(demos.split(0.2, seed=1)[1].instructions, aside.instructions)
-    assert not torch.equal(demos.split(0.2, seed=2)[1].instructions, aside.instructions)
+    episode, frame = demos[[3, 1, 0]].locate()
+    assert episode.tolist() == [0, 2, 2]
+    assert frame.tolist() == [9, 0, 1]
 
 
 def test_episodes_are_closed_where_they_do_not_end_with_a_repeated_frame():
@@ -357,7 +347,7 @@ def test_a_recording_that_was_cut_stays_so_however_it_is_written(again, tmp_path
     ],
 )
 def test_no_demonstrations_and_other_things_are_refused(use):
-    none = data.record_demonstrations("move", 4, seed=0).split(0.1)[1]
+    none = data.record_demonstrations("move", 4, seed=0)[:0]
     with pytest.raises(UserError, match="there are no demonstrations: is a selection, or"):
         use(none)
     with pytest.raises(UserError, match="'shown' is a str: give Demonstrations, such as load_pic"):

@@ -74,25 +74,21 @@ def test_a_model_reads_the_images_that_it_names(preset):
     (_, usual), _ = labels()
     (_, renamed), _ = labels(in_keys=["before", "after"])
     assert torch.equal(renamed.actions, usual.actions)
-    (buffer, swapped), model = labels(in_keys=[("next", "pixels"), "pixels"])
-    buffer = data.labelled_buffer(demos, swapped.actions, next_pixels=True)
+    (_, swapped), model = labels(in_keys=[("next", "pixels"), "pixels"])
+    frame = demos.locate()[1]
     with torch.no_grad():
-        said = model.eval()(buffer[:])["logits"].argmax(-1)
+        said = model(pixels=demos.frames(frame), next_pixels=demos.frames(frame + 1)).argmax(-1)
     assert torch.equal(said, swapped.actions.long())
 
 
 def test_samples_are_the_demonstrations_own_transitions(inverse):
     demos, truth = data.record_demonstrations("pick", 20, keep_truth=True)
-    buffer, _ = data.label_demonstrations(
-        demos, inverse, progress=False, next_pixels=True, initial_pixels=True
-    )
+    buffer, _ = data.label_demonstrations(demos, inverse, progress=False)
     row = 0
     for episode, one in enumerate(demos):
         steps = len(one) - 1
         entries = buffer[row : row + steps]
         assert torch.equal(entries["pixels"], one["pixels"][:-1])
-        assert torch.equal(entries["next", "pixels"], one["pixels"][1:])
-        assert (entries["initial_pixels"] == one["pixels"][0]).all()
         assert (entries["instruction"] == demos.instructions[episode]).all()
         assert torch.equal(entries["action"], truth.actions[row : row + steps].long())
         assert entries["final"].squeeze(-1).tolist() == [False] * (steps - 1) + [True]
@@ -126,7 +122,7 @@ def test_a_saved_report_of_any_number_of_actions_makes_the_buffer_again(tmp_path
     demos = data.record_demonstrations("move", 3)
     last = torch.arange(n_actions) == n_actions - 1
     sure = TensorDictModule(lambda x: last.float().expand(len(x), -1), ["pixels"], ["logits"])
-    _, report = data.label_demonstrations(demos, sure, device="cpu", progress=False)
+    _, report = data.label_demonstrations(demos, sure, progress=False)
     report.save(tmp_path / "labels")
     loaded = data.LabelReport.load(tmp_path / "labels")
     assert torch.equal(loaded.actions, report.actions) and loaded.actions.dtype == dtype

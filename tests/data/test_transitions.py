@@ -8,7 +8,8 @@ import torch
 from torchrl.data import Categorical, LazyTensorStorage, OneHot
 from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, Transform, TransformedEnv
 
-from ifo_grounding.data import Collected, Demonstrations, RandomActions, collect_transitions
+from ifo_grounding.data import Collected, Demonstrations, collect_transitions
+from ifo_grounding.data.transitions import RandomActions
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.world import Layout

@@ -71,8 +71,8 @@ def test_episodes_that_begin_in_inference_mode_go_on_outside(make):
 @pytest.mark.parametrize(
     ("actions", "said"),
     [
-        ([0, 6], r"actions are 0\.\.\d here, got 0\.\.6"),
-        ([-1, 0], r"actions are 0\.\.\d here, got -1\.\.0"),
+        ([0, 6], r"actions of this world hold 6: allowed are 0\.\.\d"),
+        ([-1, 0], r"actions of this world hold -1: allowed are 0\.\.\d"),
         ([0.0, 1.0], "one integer for each of .* worlds, got torch.float32"),
         ([[1], [2]], r"got torch\.int64 of shape \[\d+, 1\]"),
     ],

@@ -53,10 +53,8 @@ def test_what_does_not_fit_the_demonstrations_is_refused(recorded):
     model = scores_actions(lambda action: action)
     with pytest.raises(UserError, match="these very demonstrations"):
         reward_audit(model, demos[:5], truth)
-    with pytest.raises(UserError, match="the model knows 6"):
+    with pytest.raises(UserError, match=r"for this model, truth holds .*allowed are 0..5"):
         reward_audit(model, demos, truth.actions + 6)
-    with pytest.raises(UserError, match="at least 1"):
-        reward_audit(model, demos, truth, transitions=0)
 
 
 def test_return_is_the_sum_of_what_is_paid(make_expert):

@@ -3,7 +3,8 @@ import torch
 from torch import nn
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import ConvEncoder, NetworkConfig, PatchEncoder, Shapes, make_policy
+from ifo_grounding.networks import NetworkConfig, Shapes, make_policy
+from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
 from ifo_grounding.networks.patches import distinct_views, distinct_windows
 from ifo_grounding.networks.shapes import grid_of
 from networks.conftest import tiled

@@ -9,8 +9,9 @@ from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import episode_endings
 from ifo_grounding.modules import take_word_penalty
-from ifo_grounding.networks import ColourAndForm, GroundedTrunk, make_policy
-from ifo_grounding.networks.grounding import swap_words
+from ifo_grounding.networks import make_policy
+from ifo_grounding.networks.appearance import ColourAndForm
+from ifo_grounding.networks.grounding import GroundedTrunk, swap_words
 from ifo_grounding.networks.trunk import instructed_network
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.tasks import VOCABULARY
@@ -109,13 +110,13 @@ def test_words_are_found_before_they_are_held_to_one_meaning(shapes):
     assert loss(data)["loss_words"] == 0
     ImitationLoss(policy)  # swaps from the start, whatever came before
     assert words.swaps_words
-    with pytest.raises(UserError, match=r"share of training in \[0, 1\], got 2"):
+    with pytest.raises(UserError, match=r"words_from must be within 0..1, got 2"):
         ImitationLoss(policy, words_from=2)
 
 
 def test_words_outside_the_vocabulary_are_named(shapes):
     policy = make_policy(shapes, "strong", seed=0)
-    with pytest.raises(UserError, match="token ids from 1 to 99"):
+    with pytest.raises(UserError, match=r"hold token 99: allowed are 0\.\."):
         policy(pixels=tiles("red circle"), instruction=torch.tensor([[1, 99]]))
 
 

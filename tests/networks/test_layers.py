@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from ifo_grounding.networks import GatedAttention, GRUInstructionEncoder, ResidualBlock
+from ifo_grounding.networks.layers import GatedAttention, ResidualBlock
+from ifo_grounding.networks.sentences import GRUInstructionEncoder
 from ifo_grounding.tasks import VOCABULARY, grammar
 
 

@@ -4,7 +4,7 @@ from torch import nn
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import GRUInstructionEncoder
+from ifo_grounding.networks.sentences import GRUInstructionEncoder
 from ifo_grounding.tasks import TASKS, VOCABULARY, grammar
 from pretended_gpu import pretended_gpu
 

@@ -80,7 +80,7 @@ def test_an_env_without_instructions_says_its_vocabulary():
     [
         ({"image_shape": (3, 8)}, r"image_shape must be \(channels, height, width\)"),
         ({"image_shape": (48, 40, 3)}, r"\(48, 40, 3\) looks like.*PermuteTransform"),
-        ({"vocabulary_size": 0}, "vocabulary_size must be a positive integer, got 0"),
+        ({"vocabulary_size": 0}, "vocabulary_size must be at least 1, got 0"),
     ],
 )
 def test_impossible_sizes_are_refused(bad, said):

@@ -45,7 +45,7 @@ def test_it_can_be_called_without_a_tensordict(kind):
 
 @pytest.mark.parametrize("size", [(), (1,), (3, 4)], ids=str)
 def test_any_batch_dims_give_what_one_dim_gives(kind, size):
-    loss = make_loss(kind, make_options={"precision": "fp32"})
+    loss = make_loss(kind)
     data = batch(size)
     flat = data.reshape(-1) if size else data.unsqueeze(0)
     torch.testing.assert_close(seeded(loss, data).to_dict(), seeded(loss, flat).to_dict())

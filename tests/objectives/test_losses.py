@@ -12,7 +12,7 @@ from torch.distributions import Categorical
 from torchrl.modules import OneHotCategorical, ProbabilisticActor
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import WordMaps, grounding
+from ifo_grounding.networks import grounding
 from ifo_grounding.objectives import (
     GoalLoss,
     ImitationLoss,
@@ -153,7 +153,7 @@ def test_pairs_with_fresh_states_are_scored_as_any_pairs(preset):
 def test_words_are_swapped_only_where_the_instruction_classifier_asks_for_it(swap, monkeypatch):
     monkeypatch.setattr(grounding, "NOISE", 0.0)
     loss = make_loss("instruction", "strong", swap_words=swap)
-    words = next(part for part in loss.modules() if isinstance(part, WordMaps)).train()
+    words = next(part for part in loss.modules() if isinstance(part, grounding.WordMaps)).train()
     tokens = POOL[torch.arange(8) % 4]
     with torch.no_grad():
         heard = [words.roles(tokens)[0] for _ in range(2)]
@@ -223,7 +223,7 @@ def test_adversarial_reward_loss_by_hand():
 @pytest.mark.parametrize("action", [-1, 6, 0.5])
 def test_other_actions_than_the_networks_are_refused(kind, action):
     data = batch().set("action", torch.full((12,), action))
-    with pytest.raises(UserError, match=r"action.* (none of the network's|whole numbers) 0..5"):
+    with pytest.raises(UserError, match=r"action.* (hold .*: allowed are|whole numbers) 0..5"):
         make_loss(kind)(data)
 
 

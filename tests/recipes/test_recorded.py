@@ -14,8 +14,9 @@ def demos():
 
 
 def test_recorded_demonstrations_are_learned_from(options, tmp_path, demos):
-    from references import imitate_truth
     from two_phase import two_phase
+
+    from baselines import imitate_truth
 
     data.save_pictures(demos, tmp_path / "shown")
     given = options(f"recorded={tmp_path / 'shown'}", "demonstrations.n=30", "until=imitate")
@@ -41,7 +42,9 @@ def test_stops_are_added_where_none_is_shown(options, recipes, tmp_path, demos, 
         frames, demos.sentences(), vocabulary=demos.vocabulary, tile_size=8
     )
     write(open_ended, tmp_path / "shown")
-    read = world_of(options()).read(tmp_path / "shown")
+    given = options(f"recorded={tmp_path / 'shown'}", "demonstrations.n=99")
+    assert given.demonstrations.n == len(demos)
+    read = world_of(given).read(tmp_path / "shown")
     assert read.lengths.equal(demos.lengths - (torch.arange(len(demos)) < cut).long())
 
 

@@ -11,7 +11,7 @@ from ifo_grounding.config import STAGES
 from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
-from ifo_grounding.report import results_table
+from ifo_grounding.report import results_rows, text_table
 from pretended_gpu import pretended_gpu
 from recipes.conftest import make_stages
 
@@ -37,7 +37,7 @@ def test_both_phases_of_strong_run_through_and_write_a_report(options, tmp_path)
     assert results["phase1"]["rate"]["count"] == results["gain"]["count"] == 20
     assert "trained" in results and "continued" not in results
     assert 0 < results["labels"]["rate"]["rate"] <= 1
-    table = results_table(results)
+    table = text_table(results_rows(results))
     assert "phase 2 - phase 1" in table and "suitable rate" in table
     (file,) = (tmp_path / "kept").glob("*.json")
     assert file.name == "move-udlr-60-strong-seed0.json"
@@ -177,7 +177,7 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
     policy = load_network(run, "policy-phase1.safetensors", "imitate", given)
     tried = losses(given, run, load_demonstrations(run), None)
     theirs, *own = (
-        next(part for part in each.modules() if isinstance(part, networks.WordMaps))
+        next(part for part in each.modules() if isinstance(part, networks.grounding.WordMaps))
         for each in (policy, *tried)
     )
     for part, last in (("about_form.weight", True), ("role.weight", False)):

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from ifo_grounding import report
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Episode
+from ifo_grounding.evaluation.suitability import suitable_rate
 from ifo_grounding.evaluation.tracing import Trace
 from ifo_grounding.report.drawing import BORDER, PADDING
 from ifo_grounding.report.theme import BAD, GOOD, RUNNING
@@ -83,13 +84,13 @@ def test_cases_show_suitable_and_unsuitable_choices():
 
     yes = TensorDictModule(score, ["pixels", "instruction"], ["suitability"])
     pool = grammar("move").tokens
-    cases = report.instruction_cases(yes, "move", pool)
+    cases = report.instruction_cases(suitable_rate(yes, "move", pool, states=512), pool)
     assert [case.colour for case in cases] == [GOOD] * 8 + [BAD] * 4
     assert all(case.note == "suitable (0.95)" for case in cases[:8])
     assert "missing (0.95)" in {case.note for case in cases}
     assert cases[0].frame.shape == (3, 192, 192)
-    none = report.instruction_cases(yes, "move", pool, threshold=0.99)
-    assert none == []
+    none = suitable_rate(yes, "move", pool, states=512, threshold=0.99)
+    assert report.instruction_cases(none, pool) == []
 
 
 def test_a_step_is_a_picture_and_a_dollar_sign_no_formula():

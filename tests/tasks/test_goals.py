@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from ifo_grounding.tasks import MAX_STEPS, REASONS, TASKS, Goal, achieved, plan, verdict
+from ifo_grounding.tasks import REASONS, TASKS, Goal, achieved, plan, verdict
+from ifo_grounding.tasks.goals import MAX_STEPS
 from reference import BOXES, KINDS, SIDES, Plain, worlds
 
 

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.tasks import HOLDOUTS, N_TEMPLATES, PHRASINGS, SPLITS, TASKS, VOCABULARY, grammar
-from ifo_grounding.tasks.grammar import FIELDS, holdout_kinds, in_split
+from ifo_grounding.tasks import N_TEMPLATES, TASKS, VOCABULARY, grammar
+from ifo_grounding.tasks.grammar import FIELDS, HOLDOUTS, PHRASINGS, SPLITS, holdout_kinds, in_split
 from ifo_grounding.world import COLOURS, SHAPES, kind
 
 # Goals that a sentence can express: kinds, sides, boxes, ordered pairs of boxes or of kinds.

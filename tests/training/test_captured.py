@@ -49,7 +49,7 @@ def test_only_steps_that_are_all_the_same_can_be_captured():
 )
 def test_a_captured_step_learns_what_single_kernels_learn(make, kind, tolerance, tmp_path):
     demos, truth = record_demonstrations("move", 200, seed=0, keep_truth=True)
-    options = {"seed": 0, "device": "cuda", "dropout": 0.0, "precision": "fp32"}
+    options = {"seed": 0, "device": "cuda", "dropout": 0.0}
     config = FitConfig(steps=60, batch_size=64, iteration=10)
     found = {}
     for cudagraph in (False, True):

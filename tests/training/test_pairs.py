@@ -10,7 +10,8 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.training import pairs as pairs_module
 from ifo_grounding.training import select_pairs
-from ifo_grounding.transforms import NothingSuitableError, frame_hash
+from ifo_grounding.transforms import NothingSuitableError
+from ifo_grounding.transforms.starts import frame_hash
 from transforms.counter_world import POOL, CounterWorld, classifier
 
 
@@ -21,14 +22,12 @@ def test_pairs_are_distinct_scenes_with_suitable_instructions():
     assert {key: (value.shape[1:], value.dtype) for key, value in pairs.items()} == {
         "scene": ((1,), torch.int64),
         "instruction": ((4,), torch.int64),
-        "score": ((1,), torch.float32),
         "frame_hash": ((1,), torch.int64),
     }
     assert pairs["scene"].unique().numel() == 50
     number = (pairs["scene"] * 7 + 3) % 10
     assert (pairs["instruction"][:, :1] - 1 > number).all()
     assert (number != 9).all()
-    assert torch.allclose(pairs["score"], torch.tensor(3.0).sigmoid())
 
 
 def test_pairs_hold_the_scene_that_the_simulator_draws_again():

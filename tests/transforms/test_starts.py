@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.transforms import StartingPairs, frame_hash
+from ifo_grounding.transforms import StartingPairs
+from ifo_grounding.transforms.starts import frame_hash
 from transforms.counter_world import CounterWorld, shown
 
 

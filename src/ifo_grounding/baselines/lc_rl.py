@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -22,6 +22,7 @@ from ifo_grounding.baselines.access import (
     begin,
     check_access,
 )
+from ifo_grounding.episodes import play
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import make_instruction_classifier
@@ -199,22 +200,21 @@ class LCRL:
                     soft_values(self.rewards(*part), self.moves, self.horizon).argmax(-1)
                     for part in zip(frames.split(64), instruction.split(64), strict=True)
                 ]
-            plan = torch.cat(parts)
-            state = begin(env, scenes)
-            begun = (frames == state[keys.PIXELS].unsqueeze(1)).flatten(2).all(-1)
-            cell, success = begun.int().argmax(1), torch.zeros(rows, dtype=torch.bool)
-            running = torch.ones(rows, dtype=torch.bool)
-            for _ in range(2 * self.horizon):
-                choice = plan.gather(1, cell.unsqueeze(1)).squeeze(1)
-                action = torch.tensor(CHOICES)[choice]
-                state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
-                paid = state[keys.REWARD].reshape(-1) > 0
-                success |= running & state["done"].reshape(-1) & paid
-                running &= ~state["done"].reshape(-1)
-                cell = torch.where(
-                    choice < 4,
-                    self.moves[cell].gather(1, choice.clamp(max=3).unsqueeze(1)).squeeze(1),
-                    cell,
-                )
-            found.append(success)
+            found.append(follow(env, scenes, frames, torch.cat(parts), 2 * self.horizon))
         return torch.cat(found)[:episodes]
+
+
+def follow(env: EnvBase, scenes: Tensor, frames: Tensor, plan: Tensor, max_steps: int) -> Tensor:
+    """Follow plans, [R, cells], in scenes, int64 [R], whose cells look like frames: bool [R]."""
+    running = torch.arange(len(scenes))
+
+    def act(state: TensorDictBase) -> TensorDictBase:
+        here = (frames[running] == state[keys.PIXELS].unsqueeze(1)).flatten(2).all(-1)
+        choice = plan[running, here.int().argmax(1)]
+        return state.set(keys.ACTION, torch.tensor(CHOICES)[choice])
+
+    def run(rows: Tensor, transition: TensorDictBase) -> None:
+        nonlocal running
+        running = rows[~transition[keys.NEXT, "done"].reshape(-1)]
+
+    return play(act, env, begin(env, scenes), max_steps=max_steps, on_step=run).success

@@ -16,12 +16,7 @@ from ifo_grounding.data.lerobot import load_lerobot, save_lerobot
 from ifo_grounding.data.minari import from_minari, to_minari
 from ifo_grounding.data.pictures import load_pictures, save_pictures
 from ifo_grounding.data.recording import record_demonstrations
-from ifo_grounding.data.transitions import (
-    Collected,
-    RandomActions,
-    TransitionReport,
-    collect_transitions,
-)
+from ifo_grounding.data.transitions import Collected, TransitionReport, collect_transitions
 from ifo_grounding.data.truth import Truth
 
 __all__ = [
@@ -31,7 +26,6 @@ __all__ = [
     "FrameDecoder",
     "LabelReport",
     "Labelled",
-    "RandomActions",
     "TransitionReport",
     "Truth",
     "babyai",

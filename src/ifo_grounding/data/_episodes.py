@@ -193,8 +193,8 @@ def padded(instructions: Tensor, vocabulary: Vocabulary) -> Tensor:
     return F.pad(instructions, (0, missing))
 
 
-def row_numbers(starts: Tensor, lengths: Tensor, padded: Tensor) -> Tensor:
-    """Return frame numbers of episodes in a row, the last one repeated up to ``padded`` lengths."""
-    begin = padded.cumsum(0) - padded
-    step = torch.arange(int(padded.sum())) - begin.repeat_interleave(padded)
-    return starts.repeat_interleave(padded) + step.minimum((lengths - 1).repeat_interleave(padded))
+def rows_of(starts: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Return number and frame of episodes, int64 [sum of counts] each: so many frames of each."""
+    episode = torch.arange(len(starts)).repeat_interleave(counts)
+    step = torch.arange(len(episode)) - (counts.cumsum(0) - counts)[episode]
+    return episode, starts[episode] + step

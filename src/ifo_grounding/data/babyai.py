@@ -60,8 +60,8 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
     name = level if level.endswith(("-v0", "-v1")) else f"BabyAI-{level}-v0"
     optional("minigrid", extra="babyai")  # registers the levels
     if name not in gymnasium.registry:
-        known = sorted(i[7:-3] for i in gymnasium.registry if i.startswith("BabyAI-"))
-        raise UserError(f"there is no level {name!r}: choose among {', '.join(known)}")
+        ids = (each for each in gymnasium.registry if each.startswith("BabyAI-"))
+        check_choice("level", level, sorted(each[7:-3] for each in ids))
     return functools.partial(_Room, name, tile_size, mission)
 
 
@@ -146,11 +146,7 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
 
     Args:
         level: of BabyAI, see :func:`babyai`.
-        n: number of demonstrations.
         keep_truth: whether to return the bot's actions too, for evaluation only.
-        seed: of the stream of rooms.
-        stream: name of the stream.
-        tile_size: pixels along one side of a cell.
         processes: how many record side by side; with several, a script needs its
             ``if __name__ == "__main__":``.
         vocabulary: the words of the missions; by default those that occur.
@@ -192,10 +188,7 @@ def bot_outcomes(
     """Return whether BabyAI's bot fulfils its mission in each of the rooms of a stream, bool [N].
 
     The rooms are those that :func:`~ifo_grounding.envs.from_gymnasium` shows by their numbers, with
-    the same seed and stream; other arguments are those of :func:`record_babyai`.
-
-    Raises:
-        UserError: where minigrid is missing, there is no such level or stream, or nothing to play.
+    the same seed and stream; other arguments, and errors, are those of :func:`record_babyai`.
     """
     check_choice("stream", stream, STREAMS)
     episodes, processes = at_least_one("episodes", episodes), at_least_one("processes", processes)

@@ -11,6 +11,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Transform
 
 from ifo_grounding import keys
+from ifo_grounding.data._episodes import rows_of
 from ifo_grounding.data._spool import same_rows
 from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
@@ -62,11 +63,8 @@ def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer
     closed = demos.closed
     if not closed.any():
         raise UserError("no demonstration shows its stop: close_episodes() adds it")
-    lengths = demos.lengths
-    episode = torch.arange(len(demos)).repeat_interleave(lengths)
-    step = torch.arange(len(episode)) - (lengths.cumsum(0) - lengths)[episode]
-    frame = demos.starts[episode] + step
-    last = demos.starts + lengths - 1
+    episode, frame = rows_of(demos.starts, demos.lengths)
+    last = demos.starts + demos.lengths - 1
     earlier = ~same_rows(demos.codes, frame, last[episode])
     balance = torch.zeros(len(demos), dtype=torch.int64).scatter_add_(0, episode, earlier.long())
     finished = torch.arange(len(demos)).repeat_interleave(balance.clamp(min=1) * closed)

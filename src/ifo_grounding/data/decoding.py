@@ -61,9 +61,7 @@ class FrameDecoder(Lookup):
     frames, so that transitions share them, put a :class:`Lookup` of the codes before this.
 
     Args:
-        codec: decodes codes.
         in_keys: entries with codes; by default ``pixels`` and ``("next", "pixels")``.
-        out_keys: where the pixels go; by default the same entries.
 
     >>> import torch
     >>> from tensordict import TensorDict

@@ -14,12 +14,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from ifo_grounding import keys
-from ifo_grounding.data._episodes import Episode, Reader, check_parts, padded, row_numbers
+from ifo_grounding.data._episodes import Episode, Reader, check_parts, padded, rows_of
 from ifo_grounding.data._spool import same_rows, take
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
-from ifo_grounding.errors import UserError, share, whole
-from ifo_grounding.seeding import generator as seeded
+from ifo_grounding.errors import UserError, whole
 from ifo_grounding.tasks.vocabulary import Vocabulary, check_vocabulary, words_of
 
 KIND = "ifo-grounding demonstrations"
@@ -33,7 +32,6 @@ class Demonstrations:
     a slice or a selection shares the frames of the whole.
 
     Args:
-        codec: turns ``codes`` into pixels.
         codes: codes of all frames in a row, [F, *codec.code_shape].
         lengths: frames of each episode, at least 1, integer [N]; they add up to F.
         instructions: token ids, integer [N, L], 0 pads.
@@ -195,12 +193,6 @@ class Demonstrations:
         return self.tokens.shape[1]
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of codes, tiles, tokens and lengths."""
-        parts = (self.codes, self.tokens, self.lengths, self.starts, self.codec.tiles)
-        return sum(part.nbytes for part in parts if part is not None)
-
-    @property
     def closed(self) -> Tensor:
         """Whether each episode shows its stop, a repeated last frame, bool [N]."""
         last = self.starts + self.lengths - 1
@@ -248,13 +240,6 @@ class Demonstrations:
             setattr(chosen, name, getattr(self, name)[index])
         return chosen
 
-    def split(self, fraction: float, seed: int = 0) -> tuple[Demonstrations, Demonstrations]:
-        """Set a random ``fraction`` of the episodes aside: (the others, those)."""
-        fraction = share("fraction", fraction)
-        order = torch.randperm(len(self), generator=seeded(seed, "held-out demonstrations"))
-        aside = round(fraction * len(self))
-        return self[order[aside:].sort().values], self[order[:aside].sort().values]
-
     def close_episodes(self) -> Demonstrations:
         """Repeat the last frame of each episode that does not end with a repeated frame.
 
@@ -263,7 +248,8 @@ class Demonstrations:
         they had stopped.
         """
         lengths = self.lengths + ~self.closed
-        codes = take(self.codes, row_numbers(self.starts, self.lengths, lengths))
+        episode, rows = rows_of(self.starts, lengths)
+        codes = take(self.codes, rows.minimum((self.starts + self.lengths - 1)[episode]))
         words: Any = {"vocabulary": self.vocabulary, "vocabulary_size": self.vocabulary_size}
         return Demonstrations(self.codec, codes, lengths, self.tokens, **words)
 
@@ -275,21 +261,16 @@ class Demonstrations:
         """Return the first frame of each episode, uint8 [N, C, H, W]."""
         return self.frames(self.starts)
 
-    def locate(self, transition: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the episode and the number of the first frame of transitions, int64 [*B] each.
+    def locate(self) -> tuple[Tensor, Tensor]:
+        """Return the episode and the number of the first frame of all transitions, int64 [M] each.
 
-        Transitions are numbered episode by episode; all of them by default.
+        Transitions are numbered episode by episode.
         """
-        if transition is None:
-            transition = torch.arange(self.transitions)
-        steps = self.lengths - 1
-        ends = steps.cumsum(0)
-        episode = torch.searchsorted(ends, transition, right=True)
-        return episode, self.starts[episode] + transition - (ends - steps)[episode]
+        return rows_of(self.starts, self.lengths - 1)
 
     def save(self, folder: str | Path) -> None:
         """Write a folder of ``.npy`` files and ``meta.json``; of a selection, its frames alone."""
-        rows = row_numbers(self.starts, self.lengths, self.lengths)
+        _, rows = rows_of(self.starts, self.lengths)
         in_a_row = torch.equal(rows, torch.arange(len(self.codes)))
         codes = self.codes if in_a_row else take(self.codes, rows)
         arrays = {"codes": codes, "lengths": self.lengths, "instructions": self.tokens}

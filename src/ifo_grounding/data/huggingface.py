@@ -44,8 +44,7 @@ def from_huggingface(
             machine are opened.
         frames: name of the column of frames.
         instruction: name of the column of instructions.
-        options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
-            ``tile_size``, ``close``.
+        options: for :meth:`Demonstrations.from_episodes`.
 
     Raises:
         UserError: where a column is missing, or an episode is not as it has to be, with the number
@@ -145,7 +144,6 @@ def to_huggingface(
     ``save_to_disk``, ``to_parquet`` or ``push_to_hub`` carry them on.
 
     Args:
-        demos: with a vocabulary.
         cache_dir: where rows are written; by default the cache of ``datasets``.
 
     Raises:

@@ -87,7 +87,6 @@ def label_demonstrations(
     inverse: TensorDictModuleBase,
     *,
     batch_size: int = 1024,
-    device: torch.device | str | None = None,
     progress: bool = True,
     **buffer_options: Any,
 ) -> Labelled:
@@ -100,8 +99,6 @@ def label_demonstrations(
     Args:
         inverse: reads ``pixels`` and ``("next", "pixels")``, or two images of other names: the one
             below ``next``, else the second, is the later one. Logits [B, A] are its first output.
-        batch_size: transitions at once.
-        device: where to run; by default where the model is.
         buffer_options: for :func:`labelled_buffer`.
 
     Raises:
@@ -111,7 +108,7 @@ def label_demonstrations(
     if not demos.transitions:
         raise UserError("there is nothing to label: no episode has two frames")
     batch_size = at_least_one("batch_size", batch_size)
-    device = torch.device(device or device_of(inverse) or "cpu")
+    device = device_of(inverse) or torch.device("cpu")
     frame = demos.locate()[1]
     labels, sure, n_actions = [], [], 0
     with evaluating(inverse), progress_bar(total=len(frame), desc="label", shown=progress) as bar:
@@ -131,12 +128,7 @@ def label_demonstrations(
 
 
 def labelled_buffer(
-    demos: Demonstrations,
-    actions: Tensor,
-    *,
-    next_pixels: bool = False,
-    initial_pixels: bool = False,
-    **options: Any,
+    demos: Demonstrations, actions: Tensor, **options: Any
 ) -> TensorDictReplayBuffer:
     """Put demonstrations and labels into a replay buffer, which shares the demonstrations' frames.
 
@@ -146,8 +138,6 @@ def labelled_buffer(
 
     Args:
         actions: label of each transition, integer [M].
-        next_pixels: whether samples also hold ``("next", "pixels")``.
-        initial_pixels: whether samples also hold ``initial_pixels``, the episode's first frame.
         options: for ``TensorDictReplayBuffer``, such as ``batch_size`` or ``generator``.
 
     Raises:
@@ -176,14 +166,7 @@ def labelled_buffer(
         keys.ACTION: actions.long(),
         FINAL: (frame == last[episode]).unsqueeze(-1),
     }
-    frame_keys: list[NestedKey] = [keys.PIXELS]
-    if next_pixels:
-        stored[keys.NEXT, keys.PIXELS] = frame + 1
-        frame_keys.append((keys.NEXT, keys.PIXELS))
-    if initial_pixels:
-        stored[keys.INITIAL_PIXELS] = demos.starts[episode]
-        frame_keys.append(keys.INITIAL_PIXELS)
-    return frame_buffer(demos, stored, frame_keys, **options)
+    return frame_buffer(demos, stored, [keys.PIXELS], **options)
 
 
 def _logits(

@@ -43,8 +43,7 @@ def load_lerobot(
         camera: name of the camera, where there are several.
         stride: of so many frames one is taken, counted back from the last one.
         size: height and width that frames are scaled to; by default they stay as they are.
-        options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
-            ``tile_size``, ``close``.
+        options: for :meth:`Demonstrations.from_episodes`.
 
     Raises:
         UserError: where the folder is of another format or damaged, the camera is none of its own,
@@ -137,7 +136,6 @@ def save_lerobot(demos: Demonstrations, folder: str | Path) -> None:
     """Write demonstrations as a folder of LeRobot's format v3: pictures without loss, no actions.
 
     Args:
-        demos: with a vocabulary.
         folder: where to, a new or an empty one; it appears when everything is written.
 
     Raises:

@@ -58,8 +58,7 @@ def from_minari(
         image: name of the image in the observation; None where the observation is the image.
         instruction: name of the sentence in the observation, where it is the same throughout an
             episode, or else in the metadata of the episode or of the dataset.
-        options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
-            ``tile_size``, ``close``.
+        options: for :meth:`Demonstrations.from_episodes`.
 
     Raises:
         UserError: where Minari or the dataset is missing, the names are not those of the dataset,
@@ -198,7 +197,6 @@ def to_minari(demos: Demonstrations, dataset_id: str, **details: Any) -> MinariD
     single value, and the dataset's metadata says ``actions_absent``.
 
     Args:
-        demos: with a vocabulary.
         dataset_id: such as ``"mine/boxes-v0"``, below ``$MINARI_DATASETS_PATH``; it appears when
             everything is written.
         details: for ``minari.create_dataset_from_buffers``, such as ``author``.

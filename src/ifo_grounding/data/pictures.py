@@ -53,8 +53,7 @@ def load_pictures(
 
     Args:
         channels: 1 reads pictures as grey, 3 in colours, 4 with alpha.
-        options: for :meth:`Demonstrations.from_episodes`: ``vocabulary``, ``length``,
-            ``tile_size``, ``close``.
+        options: for :meth:`Demonstrations.from_episodes`.
 
     Raises:
         UserError: naming the episode whose line, frame or instruction is not as it has to be.
@@ -185,7 +184,6 @@ def save_pictures(
     """Write demonstrations as pictures, to look at or for other tools.
 
     Args:
-        demos: with a vocabulary.
         folder: where to, a new or an empty one; it appears when everything is written, and
             :func:`load_pictures` reads it.
         kind: ``png``, a folder of frames per episode, without loss; ``gif``, an animation of each,

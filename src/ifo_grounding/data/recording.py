@@ -14,8 +14,7 @@ from ifo_grounding.errors import at_least_one, check_choice
 from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
-from ifo_grounding.tasks.scenes import Scene, SceneOptions
-from ifo_grounding.tasks.streams import SceneStream
+from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import step
 from ifo_grounding.world.tiles import TILE_SIZES, tile_index, tile_table
@@ -47,15 +46,10 @@ def record_demonstrations(
 
     Args:
         task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
-        n: number of demonstrations.
         keep_truth: whether to return the actions too, for evaluation only.
-        seed: same seed, same demonstrations.
         tile_size: pixels along one side of a cell: 8, 16 or 32.
         scenes: for :class:`~ifo_grounding.tasks.scenes.SceneOptions`: ``split``, ``holdout``,
             ``holdout_visible``, ``stream``, ``layout``, ``max_steps``.
-
-    Raises:
-        UserError: on an unknown name or an impossible size.
 
     >>> demos = record_demonstrations("pick-out", 20, seed=0)
     >>> demos

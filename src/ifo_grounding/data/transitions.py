@@ -35,11 +35,9 @@ class RandomActions(TensorDictModuleBase):
     """A policy that draws actions with fixed probabilities, by its own generator.
 
     Args:
-        env: environment with one categorical action.
         stop_probability: probability of ``stop_action``; the others share the rest evenly. By
             default all are equally likely.
         stop_action: by default that of the environment; none where it does not say.
-        seed: of the actions.
 
     Raises:
         UserError: where the actions are not categorical, or the stop is not one of them.

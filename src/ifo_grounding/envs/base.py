@@ -19,14 +19,7 @@ DONE = ("done", "terminated", "truncated")
 
 
 class NumberedEnv(EnvBase):
-    """Worlds side by side whose scenes have numbers, with an image and an instruction.
-
-    Args:
-        num_envs: worlds side by side.
-        vocabulary: the words of the instructions.
-        instructed: whether instructions are shown.
-        device: where tensors go.
-    """
+    """Worlds side by side whose scenes have numbers, with an image and an instruction."""
 
     steps_on = True
     """A row may be stepped after its end: it goes on, or stays as it is."""

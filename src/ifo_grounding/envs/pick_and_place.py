@@ -34,8 +34,6 @@ class PickAndPlaceEnv(NumberedEnv):
 
     Args:
         task: ``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``.
-        num_envs: worlds side by side.
-        device: where they live.
         seed: seed of the stream of scenes; random by default.
         tile_size: pixels along one side of a cell: 8, 16 or 32.
         split: ``all``, ``train`` or ``zero-shot`` instructions.
@@ -43,14 +41,8 @@ class PickAndPlaceEnv(NumberedEnv):
             instruction and no reward.
         expose_state: whether the true state is in the tensordict, for tools other than learners:
             adds ``("state", ...)`` entries.
-        holdout: named list of colour-shape pairs that the split ``train`` does not mention.
-        holdout_visible: whether these pairs are still seen in scenes of the split ``train``.
-        stream: ``training``, ``validation`` or ``evaluation`` scenes.
-        layout: grid size and numbers of things.
-        max_steps: actions per episode.
 
-    Raises:
-        UserError: on an unknown name or an impossible size.
+    The others are fields of :class:`~ifo_grounding.tasks.SceneOptions`.
 
     A reset tensordict may hold ``"scene"``, int64 [*B, 1], the numbers of the scenes to begin with,
     and, where it is no observation (``"pixels"``, ``"done"``) and the worlds are instructed, an

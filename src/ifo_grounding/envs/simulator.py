@@ -7,14 +7,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.error import ResetNeeded
 from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one, check_below, check_choice
 from ifo_grounding.tasks.goals import fulfilled, plan
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.tasks.scenes import FEWEST, Scene, SceneOptions, draw_scenes, leaves
-from ifo_grounding.tasks.streams import SceneStream
+from ifo_grounding.tasks.scenes import (
+    FEWEST,
+    Scene,
+    SceneOptions,
+    SceneStream,
+    draw_scenes,
+    leaves,
+)
 from ifo_grounding.world import N_BOXES, N_KINDS, Canvas, WorldState, render, step
 from ifo_grounding.world.tiles import TILE_SIZES
 
@@ -24,6 +31,10 @@ AHEAD = 16
 """Resets of all rows for which scenes are drawn ahead; then a GPU is asked how many have begun."""
 CHUNK = 1 << 18
 """Most scenes that are drawn at once, for memory's sake."""
+
+
+class NotBegunError(UserError, ResetNeeded):
+    """A step, or a picture, before the first reset."""
 
 
 def check_actions(action: Tensor, worlds: int, count: int) -> None:
@@ -37,12 +48,7 @@ def check_actions(action: Tensor, worlds: int, count: int) -> None:
             f"got {action.dtype} of shape {list(action.shape)}"
         )
     if action.device.type == "cpu":
-        low, high = (int(bound) for bound in action.aminmax())
-        if low < 0 or high >= count:
-            raise UserError(
-                f"actions are 0..{count - 1} here, got {low}..{high}: was the policy made for "
-                "another world?"
-            )
+        check_below("actions of this world hold", action, count)
 
 
 class Simulator:
@@ -50,9 +56,6 @@ class Simulator:
 
     What it keeps is written in place, so that a step with its reset can be one CUDA graph, and is
     no inference tensor: episodes go on outside ``torch.inference_mode`` that began inside.
-
-    Raises:
-        UserError: on an impossible number or size.
     """
 
     @torch.inference_mode(False)
@@ -113,7 +116,7 @@ class Simulator:
     def scene(self) -> Scene:
         """The worlds as they are, with what they are asked, [num_envs]."""
         if not self.started:
-            raise UserError("there is no episode yet: reset the environment first")
+            raise NotBegunError("there is no episode yet: reset the environment first")
         return Scene.of(self._leaves)
 
     @property

@@ -52,7 +52,6 @@ def from_gymnasium(
         world: id for :func:`gymnasium.make`, or a function that makes the world (then give it all
             it needs, wrappers included).
         vocabulary: that of the demonstrations.
-        num_envs: worlds side by side.
         image: name of the image in the observation; None where the observation is the image.
         instruction: name of the sentence in the observation, or else in ``info``.
         instructed: whether episodes show their instruction and pay their reward. Without, an
@@ -69,7 +68,6 @@ def from_gymnasium(
             ``if __name__ == "__main__":``.
         seed: of the stream of scenes; random by default.
         stream: ``training``, ``validation`` or ``evaluation``: disjoint scenes.
-        device: where tensors go.
         make_options: for :func:`gymnasium.make`.
 
     Returns:

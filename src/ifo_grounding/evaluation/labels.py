@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.data import LabelReport, Truth
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_below
 from ifo_grounding.stats import Described, Rate, wilson
 
 
@@ -48,7 +48,6 @@ def label_accuracy(
         labelled_actions: the inverse model's labels, integer [N], in the order of the transitions,
             or the report of :func:`~ifo_grounding.data.label_demonstrations`.
         truth: the true actions, integer [N], or the :class:`~ifo_grounding.data.Truth`.
-        names: of the actions.
 
     Raises:
         UserError: where the two do not have one action per transition.
@@ -63,9 +62,8 @@ def label_accuracy(
             f"labels and truth must be one action per transition of the same demonstrations, got "
             f"{len(given)} and {len(right)}"
         )
-    n, both = len(names), torch.stack([given, right])
-    if int(both.min()) < 0 or int(both.max()) >= n:
-        raise UserError(f"actions must be 0..{n - 1}, as there are {n} names")
+    n = len(names)
+    check_below("actions with names hold", torch.stack([given, right]), n)
     hits = right[given == right].bincount(minlength=n).tolist()
     counts = right.bincount(minlength=n).tolist()
     per_action = {name: wilson(*pair) for name, *pair in zip(names, hits, counts, strict=True)}

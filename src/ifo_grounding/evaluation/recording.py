@@ -52,11 +52,9 @@ def record_episodes(
 ) -> list[Episode]:
     """Play the scenes with the given numbers and keep their frames.
 
-    Scenes are those of :func:`success_rate` with the same seed and stream: scene ``i`` is its
-    ``outcomes[i]``.
+    Scene ``i`` is ``outcomes[i]`` of :func:`success_rate` with the same seed and stream.
 
     Args:
-        policy: writes an action.
         env_or_task: name of a task, or an instructed environment with as many rows as scenes are
             asked for. Those of :func:`~ifo_grounding.envs.from_gymnasium` have numbers.
         scenes: numbers of the scenes; of other environments the first ones, ``range(n)``.

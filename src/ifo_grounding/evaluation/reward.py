@@ -15,11 +15,10 @@ from torchrl.envs import EnvBase
 from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth
 from ifo_grounding.episodes import Policy
-from ifo_grounding.errors import UserError, at_least_one
+from ifo_grounding.errors import UserError, at_least_one, check_below
 from ifo_grounding.evaluation.labels import actions_of
 from ifo_grounding.evaluation.scenes import Player, play_scenes
 from ifo_grounding.modules import device_of, evaluating
-from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Described, Estimate, Rate, auc, wilson
 from ifo_grounding.transforms import GoalReward, LearnedReward
 
@@ -38,12 +37,7 @@ class RewardAudit(Described):
 
 
 def reward_audit(
-    reward_model: TensorDictModuleBase,
-    demos: Demonstrations,
-    truth: Tensor | Truth,
-    *,
-    transitions: int = 5000,
-    seed: int = 0,
+    reward_model: TensorDictModuleBase, demos: Demonstrations, truth: Tensor | Truth
 ) -> RewardAudit:
     """Score every action in transitions of held-out demonstrations, and compare with the expert's.
 
@@ -56,14 +50,11 @@ def reward_audit(
         demos: demonstrations that the model was not trained on.
         truth: their true actions, integer [transitions], or the
             :class:`~ifo_grounding.data.Truth`.
-        transitions: how many to draw, without repetition.
-        seed: of the draw.
 
     Raises:
         UserError: where truth does not have one action per transition, or one that the model does
-            not know, or nothing to draw.
+            not know.
     """
-    transitions = at_least_one("transitions", transitions)
     n_actions = getattr(getattr(reward_model, "shapes", None), "n_actions", keys.N_ACTIONS)
     actions = actions_of(truth)
     if len(actions) != demos.transitions or not len(actions):
@@ -71,21 +62,15 @@ def reward_audit(
             f"truth has {len(actions)} actions and the demonstrations {demos.transitions} "
             "transitions: give the truth of these very demonstrations"
         )
-    if int(actions.max()) >= n_actions:
-        raise UserError(
-            f"truth has the action {int(actions.max())}, the model knows {n_actions}: give the "
-            "reward model of this world"
-        )
-    order = torch.randperm(len(actions), generator=generator(seed, "reward-audit"))
-    drawn = order[:transitions].sort().values
-    episode, frame = demos.locate(drawn)
+    check_below("for this model, truth holds action", actions, n_actions)
+    episode, frame = demos.locate()
     scores = _score_actions(reward_model, demos, episode, frame, n_actions)
-    taken = torch.nn.functional.one_hot(actions[drawn], n_actions).bool()
+    taken = torch.nn.functional.one_hot(actions, n_actions).bool()
     # Ties do not count as first: a model that finds everything right knows nothing.
     others = scores.masked_fill(taken, -torch.inf).max(1).values
     return RewardAudit(
         auc=auc(scores, taken, episode.unsqueeze(1).expand_as(scores)),
-        first=wilson(int((scores[taken] > others).sum()), len(drawn)),
+        first=wilson(int((scores[taken] > others).sum()), len(actions)),
     )
 
 
@@ -141,16 +126,11 @@ def return_audit(
     The rollouts are made for this, on instructed scenes; no learner sees their true reward.
 
     Args:
-        policy: whose episodes.
         reward: the transform that pays.
         env_or_task: name of a task, or an instructed batched environment with a true reward.
         mode: ``sampled``, so that some episodes succeed and some fail, or ``greedy``.
-        episodes: number of scenes.
         average: whether to divide by the length: a sum of probabilities pays for long episodes.
         options: of :func:`success_rate`, such as ``seed``, ``stream`` and ``max_steps``.
-
-    Raises:
-        UserError: where the reward is no such transform.
     """
     if not hasattr(reward, "pay"):
         raise UserError(

@@ -18,8 +18,8 @@ from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
 from ifo_grounding.episodes import Outcomes, Policy, play
 from ifo_grounding.errors import UserError, at_least_one, check_choice, whole
 from ifo_grounding.seeding import STREAMS, derive
+from ifo_grounding.tasks.goals import MAX_STEPS
 
-MAX_STEPS = 40
 MAX_STEPS_OF_OTHERS = 1000
 """Most actions in an environment that is given, whose episodes end by themselves mostly."""
 
@@ -39,7 +39,6 @@ def play_scenes(
     seed: int = 0,
     stream: str = "evaluation",
     batch_size: int = 1000,
-    device: torch.device | str | None = None,
     max_steps: int | None = None,
     purpose: str = "success",
     **env_options: Any,
@@ -47,13 +46,11 @@ def play_scenes(
     """Play one episode per scene, batch by batch, in eval mode and without gradients.
 
     Args:
-        policy: writes an action.
         env_or_task: as for :func:`~ifo_grounding.evaluation.success_rate`, and so are the arguments
             that are not named here.
         numbers: which scenes of the stream. Environments that are neither the library's nor of
             :func:`~ifo_grounding.envs.from_gymnasium` are seeded before each batch and have only
             the first ones, ``range(n)``.
-        play_batch: plays the scenes of one batch.
         purpose: names the random numbers that sampled actions are drawn with.
 
     Returns:
@@ -67,11 +64,10 @@ def play_scenes(
         env: EnvBase = PickAndPlaceEnv(
             env_or_task,
             num_envs=min(at_least_one("batch_size", batch_size), len(numbers)),
-            device=torch.device(device or modules.device_of(policy) or "cpu"),
             seed=seed,
             stream=stream,
             max_steps=limit,
-            **env_options,
+            **{"device": modules.device_of(policy), **env_options},
         )
         batches = _numbered(env, numbers)
     else:

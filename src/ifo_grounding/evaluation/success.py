@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -45,7 +44,6 @@ def success_rate(
     seed: int = 0,
     stream: str = "evaluation",
     batch_size: int = 1000,
-    device: torch.device | str | None = None,
     max_steps: int | None = None,
     **env_options: Any,
 ) -> SuccessResult:
@@ -64,20 +62,19 @@ def success_rate(
             would.
         mode: ``greedy`` (the headline), ``sampled``, or ``both``: greedy, with the sampled
             policy's result as its :attr:`SuccessResult.sampled`.
-        episodes: number of scenes.
         seed: of the scenes and, where sampled, of the actions.
         stream: ``evaluation`` for results, ``validation`` for choices.
         batch_size: episodes side by side, for a task's name.
-        device: where to run, for a task's name; the policy's by default.
         max_steps: most actions per episode, one that has not ended by then is a failure; by default
             40 for a task's name, and 1,000 in an environment, whose own limit may be lower.
         env_options: further arguments of :class:`~ifo_grounding.envs.PickAndPlaceEnv`, such as
-            ``tile_size`` and ``split``.
+            ``tile_size`` and ``split``; its device is the policy's by default.
 
     Raises:
         UserError: on an unknown name, no episodes, an environment without instructions, or a policy
             that writes no action.
 
+    >>> import torch
     >>> stop = lambda td: td.set("action", torch.full(td.shape, 5))
     >>> result = success_rate(stop, "move", episodes=50)
     >>> print(result.rate, result.lengths.max().item())
@@ -85,7 +82,7 @@ def success_rate(
     """
     check_choice("mode", mode, [*MODES, "both"])
     options: dict[str, Any] = {"seed": seed, "stream": stream, "batch_size": batch_size}
-    options |= {"device": device, "max_steps": max_steps, **env_options}
+    options |= {"max_steps": max_steps, **env_options}
     if mode == "both":
         greedy, sampled = (
             success_rate(policy, env_or_task, mode=each, episodes=episodes, **options)

@@ -12,15 +12,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, whole
-from ifo_grounding.evaluation.scenes import MAX_STEPS
 from ifo_grounding.modules import device_of
 from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Described, Estimate, Rate, auc, reliability, wilson
-from ifo_grounding.tasks.goals import REASONS, Goal, verdict
+from ifo_grounding.tasks.goals import MAX_STEPS, REASONS, Goal, verdict
 from ifo_grounding.tasks.grammar import FIELDS, grammar
-from ifo_grounding.tasks.scenes import SceneOptions
-from ifo_grounding.tasks.streams import SceneStream
+from ifo_grounding.tasks.scenes import SceneOptions, SceneStream
 from ifo_grounding.tasks.vocabulary import VOCABULARY
+from ifo_grounding.transforms.base import check_pool
 from ifo_grounding.transforms.choosing import PoolScorer
 from ifo_grounding.world import WorldState, render
 
@@ -88,15 +87,9 @@ def suitable_rate(
         classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
         task: name of the task, whose grammar reads the pool.
         pool: the instructions to choose from, token ids [N, 16] or sentences.
-        states: number of fresh states.
-        threshold: least probability of a suitable pair; 0.8 in the paper.
-        candidates: instructions drawn for each state.
-        choose: ``random`` or ``best``.
         pairs_per_state: random pairs of each state for precision and recall; 0 for none.
-        seed: of the states and the choices.
         stream: ``evaluation`` for results, ``validation`` for choices.
         tile_size: pixels along one side of a cell.
-        batch_size: states examined together.
         max_steps: a goal that needs more actions is unachievable.
         scene_options: of :class:`~ifo_grounding.tasks.SceneOptions`, such as ``layout``.
 
@@ -114,7 +107,9 @@ def suitable_rate(
         raise UserError(f"pairs_per_state must not be negative, got {pairs_per_state}")
     states, batch_size = at_least_one("states", states), at_least_one("batch_size", batch_size)
     device = device_of(classifier) or torch.device("cpu")
-    tokens, of_pool = read_pool(task, pool)
+    given = pool if isinstance(pool, Tensor) else VOCABULARY.encode(list(pool))
+    tokens = check_pool(given).cpu()
+    of_pool = grammar(task).parse_tokens(tokens)
     goals = of_pool.to(device)
     scorer = PoolScorer(classifier, tokens.to(device))
     draw = generator(seed, "suitability", stream)
@@ -156,15 +151,6 @@ def suitable_rate(
         score=score,
         verdict=reason,
     )
-
-
-def read_pool(task: str, pool: Tensor | Sequence[str]) -> tuple[Tensor, Goal]:
-    """Return the tokens, int64 [N, 16], and the goals [N] of a pool of instructions."""
-    tokens = pool if isinstance(pool, Tensor) else VOCABULARY.encode(list(pool))
-    if not len(tokens):
-        raise UserError("pool is empty: pass at least one instruction")
-    tokens = tokens.to("cpu", torch.int64)
-    return tokens, grammar(task).parse_tokens(tokens)
 
 
 def _servable(state: WorldState, goals: Goal, goal_numbers: Tensor, max_steps: int) -> Rate:

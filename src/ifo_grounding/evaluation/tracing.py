@@ -42,7 +42,6 @@ def trace_episode(
     """Ask a policy and the networks of learned rewards about each step of an episode.
 
     Args:
-        policy: built by ``make_policy``.
         episode: from :func:`record_episodes`, its frames as the policy sees them.
         networks: by name: reward models, which score the action that was taken, and goal
             classifiers, which say whether the instruction is fulfilled where the arm was then.

@@ -34,10 +34,6 @@ class ColourAndForm(nn.Module):
 
     Colours are what a small network finds at any pixel, form is where neighbouring pixels differ.
     The first cannot tell a circle from a square, the second red from blue.
-
-    >>> seen = ColourAndForm(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48))
-    >>> seen.colour.shape, seen.silhouette.shape, seen.where.shape
-    (torch.Size([72, 16]), torch.Size([72, 64]), torch.Size([2, 36]))
     """
 
     def __init__(self, channels: int, features: int, patch: int) -> None:

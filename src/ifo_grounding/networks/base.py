@@ -1,8 +1,6 @@
-"""What all networks share: flattening batches, checking shapes, and precision."""
+"""What all networks share: flattening batches, and checking shapes."""
 
 from __future__ import annotations
-
-import contextlib
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +11,7 @@ from ifo_grounding.networks.shapes import Shapes, grid_of
 
 
 class ImageNetwork(nn.Module):
-    """Base of the networks: takes any leading batch dims, checks shapes, computes in precision."""
+    """Base of the networks: takes any leading batch dims, and checks shapes."""
 
     def __init__(self, shapes: Shapes, config: NetworkConfig) -> None:
         super().__init__()
@@ -39,13 +37,6 @@ class ImageNetwork(nn.Module):
                 "follow: give TorchRL's value estimators deactivate_vmap=True"
             )
         return pixels.reshape(-1, *pixels.shape[-3:]), pixels.shape[:-3]
-
-    def autocast(self, tensor: Tensor) -> contextlib.AbstractContextManager[None]:
-        """Compute in the configured precision on the device of ``tensor``."""
-        if self.config.precision is None:
-            return contextlib.nullcontext()
-        rough = self.config.precision == "bf16"
-        return torch.autocast(tensor.device.type, torch.bfloat16, enabled=rough)
 
 
 def same_batch(**batches: torch.Size) -> None:

@@ -28,9 +28,6 @@ class Kinds:
     number: Tensor
     """How many cells are of each kind, [N, C]; 0 where a scene shows fewer than C."""
 
-    def __len__(self) -> int:
-        return len(self.features)
-
     def __getitem__(self, rows: Tensor | slice) -> Kinds:
         return Kinds(self.features[rows], self.place[rows], self.number[rows])
 

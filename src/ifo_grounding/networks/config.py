@@ -45,9 +45,6 @@ class NetworkConfig:
     """Sizes of the head's hidden layers."""
     dropout: float = 0.0
     """Dropout rate before each linear layer of the head."""
-    precision: str | None = None
-    """``"fp32"`` or ``"bf16"``. None leaves it to the caller: float32, unless inside
-    ``torch.autocast``."""
     conv_layers: int = 4
     """Strided convolutions (``paper``)."""
     embedding: int = 8
@@ -75,7 +72,6 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         check_choice("preset", self.preset, PRESETS)
         check_choice("sentence_pooling", self.sentence_pooling, ("last", "mean"))
-        check_choice("precision", self.precision, (None, "fp32", "bf16"))
         check_numbers(self)
         sizes = ("features", "hidden", "conv_layers", "embedding", "patch_size", "maps")
         check_range(self, *sizes, least=1, most=MOST_FEATURES)

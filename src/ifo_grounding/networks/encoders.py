@@ -19,9 +19,6 @@ class ConvEncoder(nn.Module):
     Initial weights are He's: PyTorch's own, which are smaller, would leave a fiftieth of an image's
     contrast after four layers. Where what a layer looks at repeats, over a batch of images, the
     layer sees it once.
-
-    >>> ConvEncoder(3, features=32, layers=4)(torch.zeros(2, 3, 48, 48)).shape
-    torch.Size([2, 32, 3, 3])
     """
 
     def __init__(self, channels: int, features: int, layers: int) -> None:
@@ -73,12 +70,8 @@ class PatchEncoder(nn.Module):
 
     Args:
         channels: what :attr:`complete` makes of an image's channels.
-        features: F.
         patch: pixels along one side of a patch.
         complete: makes what is embedded of patches [U, C, P * P]; by default they are as they are.
-
-    >>> PatchEncoder(3, features=64, patch=8)(torch.zeros(2, 3, 48, 48)).shape
-    torch.Size([2, 64, 6, 6])
     """
 
     def __init__(

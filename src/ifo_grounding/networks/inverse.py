@@ -42,8 +42,7 @@ class InverseNetwork(ImageNetwork):
         before, batch = self.flat_pixels(pixels)
         after, next_batch = self.flat_pixels(next_pixels)
         same_batch(pixels=batch, next_pixels=next_batch)
-        with self.autocast(pixels):
-            outputs = self._logits(self.image(torch.cat([before, after], -3)))
+        outputs = self._logits(self.image(torch.cat([before, after], -3)))
         return outputs.float().reshape(*batch, outputs.shape[-1])
 
     def reads_tiles(self, image_shape: tuple[int, ...], tile_size: int | None) -> bool:
@@ -65,9 +64,7 @@ class InverseNetwork(ImageNetwork):
         first, second, index = distinct_pairs(*codes, len(tiles), len(tiles))
         seen = torch.cat([tiles[first], tiles[second]], 1).flatten(2)
         height, width = before.shape[1:]
-        with self.autocast(tiles):
-            outputs = self._logits(self.image.look_up(seen, index, (height, width)))
-        return outputs.float()
+        return self._logits(self.image.look_up(seen, index, (height, width))).float()
 
     def _logits(self, encoded: Tensor) -> Tensor:
         """Map encoded images [N, F, h, w] to logits [N, A]."""

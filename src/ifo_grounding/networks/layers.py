@@ -25,15 +25,9 @@ class GatedAttention(nn.Module):
     to another: with PyTorch's own they differ by a hundredth, and learn from it late.
 
     Args:
-        instruction_size: D, the size of an encoded instruction.
-        features: F, the channels of the feature map.
         rate: how fast h learns, relative to the rest of the network: its weights are kept divided
             by it. Gates that learn as fast as all else saturate on what is learned first, such as
             colours, before they tell shapes apart.
-
-    >>> gate = GatedAttention(instruction_size=128, features=32)
-    >>> gate(torch.ones(2, 32, 3, 3), torch.zeros(2, 128)).shape
-    torch.Size([2, 32, 3, 3])
     """
 
     def __init__(self, instruction_size: int, features: int, rate: float = 1.0) -> None:
@@ -53,11 +47,7 @@ class GatedAttention(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """A linear layer per cell, ReLU, and a convolution of kernel 3, added to the input.
-
-    >>> ResidualBlock(64)(torch.ones(2, 64, 6, 6)).shape
-    torch.Size([2, 64, 6, 6])
-    """
+    """A linear layer per cell, ReLU, and a convolution of kernel 3, added to the input."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
@@ -72,11 +62,7 @@ class ResidualBlock(nn.Module):
 
 
 def pool_cells(image: Tensor) -> Tensor:
-    """Return the maximum and the mean over cells: [N, F, H, W] -> [N, 2 F].
-
-    >>> pool_cells(torch.tensor([[[[1.0, 3.0]]]])).tolist()
-    [[3.0, 2.0]]
-    """
+    """Return the maximum and the mean over cells: [N, F, H, W] -> [N, 2 F]."""
     return torch.cat([image.amax((-2, -1)), image.mean((-2, -1))], -1)
 
 

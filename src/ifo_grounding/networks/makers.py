@@ -23,7 +23,7 @@ from ifo_grounding.networks.inverse import InverseNetwork
 from ifo_grounding.networks.scoring import GatedScorer, PairScorer
 from ifo_grounding.networks.shapes import Shapes, check_categorical, patch_size
 from ifo_grounding.networks.trunk import InstructedNetwork, RewardNetwork
-from ifo_grounding.networks.warm_start import start_scorer, start_trunk
+from ifo_grounding.networks.warm_start import started
 from ifo_grounding.networks.word_scoring import WordScorer
 
 IMAGE_AND_WORDS: tuple[NestedKey, NestedKey] = (keys.PIXELS, keys.INSTRUCTION)
@@ -97,9 +97,6 @@ def make_inverse(
 ) -> TensorDictModule:
     """Build the inverse model: two images to logits of the actions, float32 [*B, A].
 
-    Args:
-        in_keys: the image before and the image after, uint8 [*B, C, H, W].
-
     >>> inverse = make_inverse(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> frame = torch.zeros(2, 3, 48, 48, dtype=torch.uint8)
     >>> inverse(pixels=frame, next_pixels=frame).shape
@@ -126,7 +123,6 @@ def make_policy(
     It samples by default; ``set_exploration_type`` wins over that.
 
     Args:
-        in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         action_key: where the action goes; its log-probability goes beside it, as TorchRL names it.
         logits_key: where the logits go, float32 [*B, A].
         deterministic: take the likeliest action by default.
@@ -178,10 +174,6 @@ def make_value(
 ) -> ValueOperator:
     """Build a critic: an image and an instruction to a value, float32 [*B, 1].
 
-    Args:
-        init_from: a policy whose trunk's weights are copied (a warm start).
-        in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
-
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
     >>> value = make_value(shapes, init_from=make_policy(shapes, seed=0), seed=0)
     >>> value(pixels=torch.zeros(2, 3, 48, 48), instruction=torch.ones(2, 16).long()).shape
@@ -190,9 +182,7 @@ def make_value(
     options = {"in_keys": in_keys, "out_key": out_key}
     network, kind = partial(InstructedNetwork, outputs=1), ValueOperator
     value = build("value", network, spec_source, preset, options, device, seed, overrides, kind)
-    if init_from is not None:
-        start_trunk(value.module, init_from)
-    return value
+    return started(value, init_from)
 
 
 def make_instruction_classifier(
@@ -213,10 +203,9 @@ def make_instruction_classifier(
     instructions per image cheaply.
 
     Args:
-        in_keys: the image, uint8 [*B, C, H, W], and the instruction, int64 [*B, L].
         out_key: where the logit goes; the paper's threshold of 0.8 is on its sigmoid.
-        init_from: a policy whose weights are copied (a warm start, an extension of the paper). It
-            has learned what the words look like, which first frames alone teach slowly.
+        init_from: a policy (an extension of the paper). It has learned what the words look like,
+            which first frames alone teach slowly.
         roles: whether to copy as well which words count for which map of that policy (``strong``).
             Most policies know; one that finds object and target by one map, one after the other,
             does not.
@@ -233,9 +222,7 @@ def make_instruction_classifier(
     classifier = build(
         "instruction", pair_scorer, spec_source, preset, options, device, seed, overrides
     )
-    if init_from is not None:
-        start_scorer(classifier.module, init_from, roles)
-    return classifier
+    return started(classifier, init_from, roles)
 
 
 def make_goal_classifier(
@@ -255,10 +242,8 @@ def make_goal_classifier(
     (``encode_scenes`` of both images, ...) work as those of the instruction classifier.
 
     Args:
-        in_keys: the episode's first image and the present one, uint8 [*B, C, H, W], and the
-            instruction, int64 [*B, L].
-        init_from: a policy whose weights are copied (a warm start): the classifier then sees
-            nothing of the first image, until it learns to.
+        init_from: a policy: the classifier then sees nothing of the first image, until it learns
+            to.
 
     >>> shapes = Shapes(image_shape=(3, 48, 48), vocabulary_size=40)
     >>> classifier = make_goal_classifier(shapes, seed=0)
@@ -269,9 +254,7 @@ def make_goal_classifier(
     options = {"in_keys": in_keys, "out_key": out_key}
     scorer = partial(pair_scorer, images=2)
     classifier = build("goal", scorer, spec_source, preset, options, device, seed, overrides)
-    if init_from is not None:
-        start_scorer(classifier.module, init_from)
-    return classifier
+    return started(classifier, init_from)
 
 
 def make_reward_model(
@@ -290,11 +273,8 @@ def make_reward_model(
     ``all_actions(pixels, instruction)`` of the result scores every action at once, [*B, A].
 
     Args:
-        in_keys: the image, uint8 [*B, C, H, W], the instruction, int64 [*B, L], and the action,
-            integer [*B].
-        init_from: a policy whose trunk's weights are copied (a warm start, an extension of the
-            paper). Self-examination leads a policy to what its reward model likes best, so that
-            this has to know as much.
+        init_from: a policy (an extension of the paper). Self-examination leads it to what its
+            reward model likes best, so that this has to know as much.
 
     >>> rwd = make_reward_model(Shapes(image_shape=(3, 48, 48), vocabulary_size=40), seed=0)
     >>> image, words = torch.zeros(2, 3, 48, 48, dtype=torch.uint8), torch.ones(2, 16).long()
@@ -303,6 +283,4 @@ def make_reward_model(
     """
     options = {"in_keys": in_keys, "out_key": out_key}
     model = build("reward", RewardNetwork, spec_source, preset, options, device, seed, overrides)
-    if init_from is not None:
-        start_trunk(model.module, init_from)
-    return model
+    return started(model, init_from)

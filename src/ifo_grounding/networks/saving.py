@@ -1,4 +1,4 @@
-"""Networks on disk: a file of weights, or a folder for others with words and a model card."""
+"""Networks on disk: a file of weights and words, or a folder for others with a model card."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from safetensors.torch import save_file
 from torch import nn
 
 from ifo_grounding.errors import UserError, first_line
-from ifo_grounding.files import atomic_write, read_json, regular_file, unwritable
+from ifo_grounding.files import atomic_write, regular_file, unwritable
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks import makers
 from ifo_grounding.networks.card import LIBRARY, card
-from ifo_grounding.networks.hub import CARD, OWN, WEIGHTS, WORDS, downloaded, own, upload
+from ifo_grounding.networks.hub import CARD, OWN, WEIGHTS, downloaded, own, upload
 from ifo_grounding.networks.makers import Blueprint
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.tasks.vocabulary import Vocabulary
@@ -34,6 +34,8 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "reward": makers.make_reward_model,
     "goal": makers.make_goal_classifier,
 }
+GONE = ("precision",)
+"""Options that older files name, and that decide nothing."""
 MOST_BUFFERS = 1 << 28  # bytes that depend on the size of images, and on no weight
 
 
@@ -57,7 +59,19 @@ def save(module: nn.Module, path: str | Path) -> str:
     >>> all(map(torch.equal, policy.state_dict().values(), again.state_dict().values()))
     True
     """
-    return _write(module, Path(path), getattr(module, "vocabulary", None))
+    path, plan = Path(path), asdict(_blueprint(module))
+    words: Any = module.vocabulary
+    plan["vocabulary"] = None if words is None else asdict(words)
+    texts = {"format": FORMAT, "network": json.dumps(plan, sort_keys=True)}
+    state = module.state_dict().items()
+    weights = {name: value.detach().cpu().contiguous() for name, value in state}
+    checksum = _checksum(texts, weights)
+    try:
+        with atomic_write(path) as temporary:
+            save_file(weights, temporary, {**texts, "checksum": checksum})
+    except (OSError, SafetensorError) as error:
+        raise unwritable(path, first_line(error)) from error
+    return checksum
 
 
 def load(
@@ -83,7 +97,8 @@ def load(
     try:
         options = {name: _key(value) for name, value in plan["options"].items()}
         options["in_keys"] = [_key(value) for value in plan["options"]["in_keys"]]
-        make = partial(MAKERS[found], Shapes(**plan["shapes"]), **options, **plan["config"])
+        config = {name: value for name, value in plan["config"].items() if name not in GONE}
+        make = partial(MAKERS[found], Shapes(**plan["shapes"]), **options, **config)
         with torch.device("meta"):  # takes no memory for sizes that a file only claims
             claimed = make(device="meta")
         claimed.load_state_dict(weights, assign=True)
@@ -91,6 +106,9 @@ def load(
             raise ValueError(f"images of {plan['shapes']['image_shape']} are too large")
         module = make(device=device, seed=0)
         module.load_state_dict(weights)
+        if (words := plan.get("vocabulary")) is not None:
+            module.vocabulary = Vocabulary(**words)
+            _blueprint(module)
     except torch.OutOfMemoryError:
         raise  # says nothing against the file
     except (LookupError, TypeError, AttributeError, RuntimeError, ValueError) as error:
@@ -98,8 +116,6 @@ def load(
             f"{path} does not fit this version of ifo-grounding ({first_line(error)}): train the "
             "network again"
         ) from None
-    if (words := plan.get("vocabulary")) is not None:
-        module.vocabulary = _vocabulary(words, module.network_config.shapes, path)
     return module
 
 
@@ -107,7 +123,6 @@ def save_pretrained(
     module: nn.Module,
     folder: str | Path,
     *,
-    vocabulary: Vocabulary | None = None,
     facts: Mapping[str, object] | None = None,
     hub_id: str | None = None,
     **hub: Any,
@@ -118,33 +133,30 @@ def save_pretrained(
         folder: where to. In a folder that exists, the card and ``network.safetensors`` are
             replaced, never what symbolic links of these names point to. Everything else stays, and
             so does a ``README.md`` that is no card of this library.
-        vocabulary: the words of its token ids, by default the ``vocabulary`` of ``module``.
         facts: what the card says, such as ``{"Task": "move", "Success": "99.7% [99.5, 99.8]"}``.
         hub_id: ``user/name`` on the Hub; needs the extra ``hub`` and an account that is logged in.
         hub: ``private``, ``token``, and options of ``huggingface_hub.HfApi.upload_folder`` such as
             ``commit_message``, ``revision`` or ``create_pr``.
 
     Raises:
-        UserError: for a module that no ``make_*`` function built, words that do not fit it, a
-            ``folder`` that is none, a missing extra, or where the Hub refuses.
+        UserError: as of :func:`save`, for a ``folder`` that is none, a missing extra, or where the
+            Hub refuses.
     """
-    if vocabulary is None:
-        vocabulary = getattr(module, "vocabulary", None)
-    folder, plan = Path(folder), _blueprint(module, vocabulary)
+    folder, plan = Path(folder), _blueprint(module)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
             f"{folder} is no folder and cannot be made one ({error.strerror}): choose another"
         ) from None
-    page, weights, words = (folder / name for name in (CARD, WEIGHTS, WORDS))
-    for path in (page, weights, words):
-        if path.is_symlink() or path == words:  # of the network that was here before
-            path.unlink(missing_ok=True)
+    page, weights = folder / CARD, folder / WEIGHTS
+    for path in (page, weights):
+        if path.is_symlink():
+            path.unlink()
     if not page.is_file() or LIBRARY in page.read_text(encoding="utf-8", errors="replace"):
         with atomic_write(page) as temporary:
             temporary.write_text(card(plan, facts or {}), encoding="utf-8", errors="replace")
-    _write(module, weights, vocabulary)
+    save(module, weights)
     if hub_id is not None:
         upload(folder, hub_id, **hub)
     return folder
@@ -156,7 +168,7 @@ def from_pretrained(
     kind: str | None = None,
     **hub: Any,
 ) -> Any:
-    """Load a network that :func:`save_pretrained` wrote, with its words as ``vocabulary``, or None.
+    """Load a network that :func:`save_pretrained` wrote, with its words.
 
     Args:
         source: its folder, ``user/name`` on the Hugging Face Hub (extra ``hub``), or
@@ -169,7 +181,7 @@ def from_pretrained(
 
     Raises:
         UserError: where there is no such folder, here or on the Hub, or it holds no network of
-            that kind, or its words are damaged or another network's.
+            that kind.
 
     >>> policy = from_pretrained("ifo-grounding/move")
     >>> policy.vocabulary.decode(policy.vocabulary.encode(["move to the red circle"]))
@@ -185,39 +197,25 @@ def from_pretrained(
                 "user/name"
             )
         folder = downloaded(str(source), hub)
-    module = load(folder / WEIGHTS, device=device, kind=kind)
-    words = folder / WORDS
-    if module.vocabulary is None and words.is_file():
-        module.vocabulary = _vocabulary(read_json(words), module.network_config.shapes, words)
-    return module
+    return load(folder / WEIGHTS, device=device, kind=kind)
 
 
-def _blueprint(module: nn.Module, vocabulary: Vocabulary | None) -> Blueprint:
-    """Return what a network was built by, or refuse what cannot be saved with these words."""
+def _blueprint(module: Any) -> Blueprint:
+    """Return what a network was built by, or refuse other modules, and words that do not fit."""
     plan = getattr(module, "network_config", None)
     if not isinstance(plan, Blueprint):
         raise UserError(
             f"cannot save {type(module).__name__}: only what a make_* function of "
             "ifo_grounding.networks built can be saved"
         )
-    _check_fit(vocabulary, plan.shapes, "the vocabulary")
+    words, shapes = module.vocabulary, plan.shapes
+    if words is not None and not shapes.fit(words):
+        raise UserError(
+            f"the vocabulary has {len(words)} token ids and {words.length} per instruction, but "
+            f"the network was built for {shapes.vocabulary_size} and {shapes.instruction_length}: "
+            "set the vocabulary that it was built for"
+        )
     return plan
-
-
-def _write(module: nn.Module, path: Path, vocabulary: Vocabulary | None) -> str:
-    """Write a network and the words of its token ids, and return their checksum."""
-    plan = asdict(_blueprint(module, vocabulary))
-    plan["vocabulary"] = None if vocabulary is None else asdict(vocabulary)
-    texts = {"format": FORMAT, "network": json.dumps(plan, sort_keys=True)}
-    state = module.state_dict().items()
-    weights = {name: value.detach().cpu().contiguous() for name, value in state}
-    checksum = _checksum(texts, weights)
-    try:
-        with atomic_write(path) as temporary:
-            save_file(weights, temporary, {**texts, "checksum": checksum})
-    except (OSError, SafetensorError) as error:
-        raise unwritable(path, first_line(error)) from error
-    return checksum
 
 
 def _read(path: Path, checksum: str | None) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
@@ -260,25 +258,3 @@ def _checksum(texts: Mapping[str, str], weights: Mapping[str, torch.Tensor]) -> 
 def _key(value: Any) -> Any:
     """Turn a nested key, of which JSON made a list, into a tuple again."""
     return tuple(value) if isinstance(value, list) else value
-
-
-def _vocabulary(found: Any, shapes: Shapes, path: str | Path) -> Vocabulary:
-    """Return words as JSON has them, or refuse what is damaged or another network's."""
-    try:
-        vocabulary = Vocabulary(found["words"], found["length"])
-    except (TypeError, KeyError, AttributeError, UserError) as error:
-        raise UserError(
-            f"{path} holds no words ({first_line(error)}): restore it, or save the network again "
-            "with its vocabulary"
-        ) from None
-    _check_fit(vocabulary, shapes, str(path))
-    return vocabulary
-
-
-def _check_fit(vocabulary: Vocabulary | None, shapes: Shapes, name: str) -> None:
-    if vocabulary is not None and not shapes.fit(vocabulary):
-        raise UserError(
-            f"{name} has {len(vocabulary)} token ids and {vocabulary.length} per instruction, but "
-            f"the network was built for {shapes.vocabulary_size} and {shapes.instruction_length}: "
-            "pass the vocabulary that it was built for"
-        )

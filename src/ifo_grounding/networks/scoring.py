@@ -52,10 +52,6 @@ class PairScorer(ImageNetwork):
         Bayes' rule gives :math:`\log\frac{p}{1-p} = z + \log\frac{\pi}{1-\pi}`. Against a
         mixture that holds the share :math:`\pi` of suitable ones, :math:`p = \pi e^z`
         (Elkan and Noto 2008), at most 1. Beyond :data:`SUREST` scores keep their order.
-
-        Args:
-            share: :math:`\pi`.
-            mixed: whether negatives were such a mixture.
         """
         self.prior.fill_(math.log(share) if mixed else math.log(share / (1 - share)))
         self.mixed.fill_(mixed)
@@ -96,9 +92,8 @@ class PairScorer(ImageNetwork):
         Returns logits, float32 [N, K].
         """
         rows = max(1, PAIRS_AT_ONCE // max(index.shape[1], 1))
-        with self.autocast(words):
-            some = [slice(begin, begin + rows) for begin in range(0, max(len(index), 1), rows)]
-            read = [self.head(self._read(scenes[part], words, index[part])) for part in some]
+        some = [slice(begin, begin + rows) for begin in range(0, max(len(index), 1), rows)]
+        read = [self.head(self._read(scenes[part], words, index[part])) for part in some]
         return self._expected(torch.cat(read).squeeze(-1))
 
     def _read(self, scenes: Any, words: Tensor, index: Tensor) -> Tensor:
@@ -127,8 +122,7 @@ class GatedScorer(PairScorer):
     def encode_scenes(self, *pixels: Tensor) -> Tensor:
         """Map images, each [*B, C, H, W], to features [N, F, h, w]."""
         images = [self.flat_pixels(image)[0] for image in pixels]
-        with self.autocast(pixels[0]):
-            features: Tensor = self.trunk.image(torch.cat(images, -3))
+        features: Tensor = self.trunk.image(torch.cat(images, -3))
         return features
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:  # noqa: D102

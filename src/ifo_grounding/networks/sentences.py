@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_below
 from ifo_grounding.networks.cells import look_up
 
 WORD_GAIN = 2.0
@@ -34,10 +34,6 @@ class GRUInstructionEncoder(nn.Module):
         hidden: size of the state, each way.
         rate: how fast it learns, relative to the rest of a network: weights are kept divided by it.
         pooling: ``"mean"`` or ``"last"``: which states make the feature, of size 2 * hidden.
-
-    >>> encoder = GRUInstructionEncoder(vocabulary_size=40, embedding=8, hidden=64)
-    >>> encoder(torch.randint(40, (5, 16))).shape
-    torch.Size([5, 128])
     """
 
     def __init__(
@@ -197,10 +193,5 @@ def without_padding(tokens: Tensor, words: int) -> Tensor:
     """Cut [N, L] behind the end of the longest instruction, or refuse ids of no word."""
     if not tokens.numel():
         return tokens
-    lowest, highest = tokens.aminmax()
-    if lowest < 0 or highest >= words:
-        raise UserError(
-            f"instructions hold token ids from {int(lowest)} to {int(highest)}, but this "
-            f"network knows 0 to {words - 1}: build it with the vocabulary of the data"
-        )
+    check_below("instructions for this network hold token", tokens, words)
     return tokens[:, : max(int(sentence_lengths(tokens).max()), 1)]

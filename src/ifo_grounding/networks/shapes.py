@@ -12,7 +12,7 @@ from torchrl.data import Bounded, Categorical, OneHot
 from ifo_grounding import keys
 from ifo_grounding.attributes import attribute
 from ifo_grounding.channels import channels_last
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
@@ -50,8 +50,7 @@ n_actions=6, tile_size=None)
             )
         object.__setattr__(self, "image_shape", tuple(map(int, self.image_shape)))
         for name in ("vocabulary_size", "instruction_length", "n_actions"):
-            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
-                raise UserError(f"{name} must be a positive integer, got {getattr(self, name)!r}")
+            at_least_one(name, getattr(self, name))
 
     @classmethod
     def of(

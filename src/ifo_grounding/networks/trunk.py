@@ -61,8 +61,7 @@ class InstructedNetwork(ImageNetwork):
         """Map pixels [*B, C, H, W] and token ids [*B, L] to float32 [*B, outputs]."""
         image, batch = self.flat_pixels(pixels)
         same_batch(pixels=batch, instruction=instruction.shape[:-1])
-        with self.autocast(pixels):
-            outputs = self.head(self.trunk(image, instruction.reshape(-1, instruction.shape[-1])))
+        outputs = self.head(self.trunk(image, instruction.reshape(-1, instruction.shape[-1])))
         return outputs.float().reshape(*batch, outputs.shape[-1])
 
 

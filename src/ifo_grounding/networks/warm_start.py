@@ -2,36 +2,38 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks.grounding import MEANING, GroundedTrunk
-from ifo_grounding.networks.scoring import GatedScorer, PairScorer
+from ifo_grounding.networks.scoring import GatedScorer
 from ifo_grounding.networks.trunk import GatedTrunk, InstructedNetwork, instructed_network
 from ifo_grounding.networks.word_scoring import WordScorer
 
 Parts = list[tuple[nn.Module, nn.Module]]
 
 
-def start_trunk(network: InstructedNetwork, policy: nn.Module) -> None:
-    """Copy the weights of a policy's trunk to a critic or a reward model."""
-    source = instructed_network(policy)
-    _copy(source, network, [(source.trunk, network.trunk)])
+def started(module: Any, policy: nn.Module | None, roles: bool = False) -> Any:
+    """Return a module with what a policy, where one is given, has learned, which it remembers.
 
-
-def start_scorer(network: PairScorer, policy: nn.Module, roles: bool = False) -> None:
-    """Copy what a policy has learned of words, cells and places; of several images, to the last.
-
-    Of words that are read one by one that is what they look like and which side they name. Which
-    of them count for which map is learned anew, unless ``roles`` says otherwise: a policy may hear
+    A critic and a reward model get its trunk. A classifier gets what it has learned of words, cells
+    and places; of several images it reads the last one as the policy does, the others not yet. Of
+    words that are read one by one that is what they look like and which side they name. Which of
+    them count for which map is learned anew, unless ``roles`` says otherwise: a policy may hear
     object and target in one map, one after the other, which tells nobody whether both are there.
     """
-    source = instructed_network(policy)
+    if policy is None:
+        return module
+    source, network = instructed_network(policy), module.module
     trunk = source.trunk
     parts: Parts = []
     widened: Parts = []
-    if isinstance(trunk, GroundedTrunk) and isinstance(network, WordScorer):
+    if isinstance(network, InstructedNetwork):
+        parts = [(trunk, network.trunk)]
+    elif isinstance(trunk, GroundedTrunk) and isinstance(network, WordScorer):
         theirs, own = trunk.words, network.words
         meaning = [(getattr(theirs, name), getattr(own, name)) for name in MEANING]
         parts = [(trunk.appearance, network.appearance), *([(theirs, own)] if roles else meaning)]
@@ -40,28 +42,16 @@ def start_scorer(network: PairScorer, policy: nn.Module, roles: bool = False) ->
         gated = network.trunk
         parts = [(trunk.instruction, gated.instruction), (trunk.fusion, gated.fusion)]
         widened = [(trunk.image, gated.image)]
-    _copy(source, network, parts, widened)
-
-
-def _copy(
-    source: InstructedNetwork,
-    network: InstructedNetwork | PairScorer,
-    parts: Parts,
-    widened: Parts | tuple[()] = (),
-) -> None:
-    """Copy the weights of each pair's first module to its second, which remembers them.
-
-    Of ``widened`` the second may read several images, whose inputs lie one after the other: it
-    reads the last one as the first module does, the others not yet.
-    """
     try:
         if source.config.preset != network.config.preset:
             raise RuntimeError
         for given, taken in parts:
             taken.load_state_dict(given.state_dict())
         for given, taken in widened:
-            own, theirs = taken.state_dict(), given.state_dict()
-            fitted = {name: _last(weight, own[name]) for name, weight in theirs.items()}
+            like = taken.state_dict()
+            fitted = {
+                name: _last(weight, like[name]) for name, weight in given.state_dict().items()
+            }
             taken.load_state_dict(fitted)
     except RuntimeError:
         raise UserError(
@@ -70,7 +60,8 @@ def _copy(
         ) from None
     for _, taken in [*parts, *widened]:
         copied = {name: weight.detach().clone() for name, weight in taken.named_parameters()}
-        taken.inherited = copied
+        taken.inherited = copied  # type: ignore[assignment]
+    return module
 
 
 def inherited(module: nn.Module) -> list[tuple[nn.Parameter, Tensor]]:

@@ -38,9 +38,8 @@ class WordScorer(PairScorer):
 
     A cell's features are what every word of the vocabulary says of it, for each image, and what
     silent heads see in all images; an instruction's are how much every word counts for each map.
-    Their product are the maps, which tell places, as in
-    :class:`~ifo_grounding.networks.GroundedTrunk`, what lies around them, whether there is one, and
-    how many cells fit.
+    Their product are the maps, which tell places, as in ``GroundedTrunk``, what lies around them,
+    whether there is one, and how many cells fit.
 
     A policy asks where the evidence for a word is greatest; a classifier, whether it is enough. So
     each word has a threshold, which shifts what is said of all cells alike: places stay as they
@@ -84,24 +83,23 @@ class WordScorer(PairScorer):
     def encode_scenes(self, *pixels: Tensor) -> Kinds:
         """Encode images, each [*B, C, H, W], those of their cells that look alike once."""
         images = [self.flat_pixels(image)[0] for image in pixels]
-        with self.autocast(pixels[0]):
-            tables = self._tables(images)
-            forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
-            around = F.relu(surroundings(self.around, F.relu(forms), self.grid))
-            place = self.place.to(around.dtype).expand(len(around), -1, -1)
-            index = tables[0].where
-            for table in tables[1:]:
-                index = index * len(table.said) + table.where
-            kind, number, mean = group_cells(index, torch.cat([place, around], -1))
-            cells: list[Tensor] = []
-            for table in reversed(tables):
-                cells.insert(0, kind % len(table.said))
-                kind = kind // len(table.said)
-            both = list(zip(tables, cells, strict=True))
-            said = [look_up(table.said, own) for table, own in both]
-            silent = sum(look_up(table.silent, own) for table, own in both)
-            silent = silent + torch.cat([self.attention.bias, self.value.bias])
-            features = torch.cat([*said, silent, mean[..., 2:]], -1)
+        tables = self._tables(images)
+        forms = sum(look_up(table.forms, table.where) for table in tables) + self.form.bias
+        around = F.relu(surroundings(self.around, F.relu(forms), self.grid))
+        place = self.place.to(around.dtype).expand(len(around), -1, -1)
+        index = tables[0].where
+        for table in tables[1:]:
+            index = index * len(table.said) + table.where
+        kind, number, mean = group_cells(index, torch.cat([place, around], -1))
+        cells: list[Tensor] = []
+        for table in reversed(tables):
+            cells.insert(0, kind % len(table.said))
+            kind = kind // len(table.said)
+        both = list(zip(tables, cells, strict=True))
+        said = [look_up(table.said, own) for table, own in both]
+        silent = sum(look_up(table.silent, own) for table, own in both)
+        silent = silent + torch.cat([self.attention.bias, self.value.bias])
+        features = torch.cat([*said, silent, mean[..., 2:]], -1)
         return Kinds(features.transpose(1, 2), mean[..., :2], number)
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential, dispatch
 from torch.distributions import Categorical
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, share
 from ifo_grounding.modules import has_word_penalty, set_word_swapping, take_word_penalty
 from ifo_grounding.objectives.base import ActionKeys, SupervisedLoss, check_action
 
@@ -20,9 +20,9 @@ class ImitationLoss(SupervisedLoss):
     Writes ``loss_imitation``, ``accuracy`` and ``entropy``. TorchRL's ``BCLoss`` does not fit: it
     takes integer actions for logits.
 
-    Of a network with :class:`~ifo_grounding.networks.WordMaps`, which reads word by word, it also
-    writes ``loss_words``, which regularises what words say about colours and about form; its weight
-    grows with the likelihood of the actions. A word that needs but one of the two then keeps to it.
+    Of a network with word maps (``strong``) it also writes ``loss_words``, which regularises what
+    words say about colours and about form; its weight grows with the likelihood of the actions. A
+    word that needs but one of the two then keeps to it.
 
     Args:
         network: a policy with ``get_dist``, such as ``make_policy`` or TorchRL's
@@ -62,12 +62,9 @@ class ImitationLoss(SupervisedLoss):
             )
         super().__init__(network)
         self.parts = parts
-        if not 0 <= words_from <= 1:
-            raise UserError(f"words_from is a share of training in [0, 1], got {words_from}")
         words = ["loss_words"] if has_word_penalty(network) else []
         self.out_keys = ["loss_imitation", *words, "accuracy", "entropy"]
-        self.word_penalty = word_penalty
-        self.words_from = words_from
+        self.word_penalty, self.words_from = word_penalty, share("words_from", words_from)
         self.set_progress(0.0)
 
     def set_progress(self, fraction: float) -> None:

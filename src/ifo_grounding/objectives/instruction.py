@@ -118,7 +118,7 @@ class InstructionLoss(SupervisedLoss):
         if expect is None:
             raise UserError(
                 f"{type(self.network.module).__name__} has no method expect(share, mixed), which "
-                "shifts its logits: see networks.PairScorer.expect"
+                "shifts its logits: see PairScorer.expect in networks/scoring.py"
             )
         share = max(self.negatives.suitable_share(), 1 / len(self.negatives.pool))
         expect(share, self.unlabelled == "mixture" or not self.negatives.removal_rate)

@@ -9,7 +9,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from ifo_grounding.distinct import distinct_rows
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, share
+from ifo_grounding.modules import halves_of
 from ifo_grounding.objectives.mixture import MixtureEstimate
 
 MOST_REMOVED = 0.5
@@ -58,23 +59,17 @@ class NegativeInstructions(nn.Module):
         near: float = 0.0,
     ) -> None:
         super().__init__()
-        if not 0 <= near < 1:
-            raise UserError(f"near is a share in [0, 1), got {near}")
         if not isinstance(pool, Tensor) or pool.ndim != 2 or pool.dtype.is_floating_point:
             found = (pool.dtype, [*pool.shape]) if isinstance(pool, Tensor) else type(pool).__name__
             raise UserError(f"pool must be token ids [P, L], such as demos.pool(), got {found}")
-        if removal_rate is not None and not 0 <= removal_rate < 1:
-            raise UserError(
-                f"removal_rate must lie in [0, 1), or be None to estimate it, got {removal_rate}"
-            )
         distinct = torch.unique(pool, dim=0)
         if len(distinct) < 2:
             raise UserError("pool holds fewer than two different instructions: no negatives exist")
         self.register_buffer("pool", distinct, persistent=False)
         self.register_buffer("bound", torch.ones(()))
-        self.given = removal_rate or 0.0
+        self.given = share("removal_rate", removal_rate or 0.0, full=False)
         self.estimate = MixtureEstimate() if removal_rate is None else None
-        self.warmup, self.near = warmup, near
+        self.warmup, self.near = warmup, share("near", near, full=False)
         self.progress = 1.0
         self.neighbours: dict[tuple[int, ...], Tensor] = {}
 
@@ -147,11 +142,7 @@ class NegativeInstructions(nn.Module):
         return self.estimate is None and not self.given
 
     def suitable_share(self) -> float:
-        """Return the share of suitable ones as it is estimated by now, at most ``MOST_REMOVED``.
-
-        Raises:
-            UserError: where it is not estimated.
-        """
+        """Return the share of suitable ones as it is estimated by now, at most ``MOST_REMOVED``."""
         if self.estimate is None:
             raise UserError("the share of suitable pairs needs removal_rate=None")
         bound = float(self.bound) or 1.0  # none are dropped, and the estimate is free to move
@@ -184,28 +175,20 @@ def pair_scores(
 ) -> tuple[Tensor, Tensor]:
     """Score each row's own instruction and others, token ids [N, K, L]: logits [N] and [N, K].
 
-    A network with ``encode_scenes``, ``encode_instruction`` and ``score_candidates`` encodes each
-    row's images and each distinct instruction once; any other runs once per pair. On a GPU, where
-    finding the distinct ones would wait for it, all are encoded unless scenes are shared.
+    Each row's images and each distinct instruction are encoded once. On a GPU, where finding the
+    distinct ones would wait for it, all are encoded unless scenes are shared.
     """
     *pixel_keys, instruction_key = network.in_keys
     both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
-    count = both.shape[1]
-    parts = ("encode_scenes", "encode_instruction", "score_candidates")
-    if all(hasattr(network, name) for name in parts):
-        scenes = network.encode_scenes(*(batch.get(key) for key in pixel_keys))
-        tokens = both.flatten(0, 1).long()
-        if tokens.is_cuda and isinstance(scenes, Tensor):
-            which = torch.arange(len(tokens), device=tokens.device)
-        else:
-            tokens, which = distinct_rows(tokens)
-        words = network.encode_instruction(tokens)
-        scores = network.score_candidates(scenes, words, which.view(-1, count))
+    halves, count = halves_of(network, output), both.shape[1]
+    scenes = halves.encode_scenes(*(batch.get(key) for key in pixel_keys))
+    tokens = both.flatten(0, 1).long()
+    if tokens.is_cuda and isinstance(scenes, Tensor | TensorDictBase):
+        which = torch.arange(len(tokens), device=tokens.device)
     else:
-        rows = torch.arange(len(both), device=both.device).repeat_interleave(count)
-        pairs = batch.select(*pixel_keys)[rows].set(instruction_key, both.flatten(0, 1))
-        scores = network(pairs).get(output)
-    scores = scores.reshape(-1, count)
+        tokens, which = distinct_rows(tokens)
+    words = halves.encode_instruction(tokens)
+    scores = halves.score_candidates(scenes, words, which.view(-1, count)).reshape(-1, count)
     return scores[:, 0], scores[:, 1:]
 
 

@@ -6,8 +6,8 @@ from ifo_grounding.report.drawing import Captioned, gallery
 from ifo_grounding.report.page import write_report
 from ifo_grounding.report.plots import rates_by_number, reliability_diagram, training_curves
 from ifo_grounding.report.provenance import provenance
-from ifo_grounding.report.results import results_rows, results_table
-from ifo_grounding.report.tables import format_cell, markdown_table, text_table
+from ifo_grounding.report.results import results_rows
+from ifo_grounding.report.tables import markdown_table, text_table
 from ifo_grounding.report.theme import figure_png
 from ifo_grounding.report.tracing import trace_animation
 
@@ -15,7 +15,6 @@ __all__ = [
     "Captioned",
     "animation",
     "figure_png",
-    "format_cell",
     "gallery",
     "instruction_cases",
     "markdown_table",
@@ -23,7 +22,6 @@ __all__ = [
     "rates_by_number",
     "reliability_diagram",
     "results_rows",
-    "results_table",
     "text_table",
     "trace_animation",
     "training_curves",

@@ -31,7 +31,6 @@ def animation(
         episodes: what to show, such as :func:`~ifo_grounding.evaluation.record_episodes` returns.
         titles: a word above each, such as ``phase 1``.
         actions: names of the actions, by default those of the grid.
-        columns: episodes side by side.
         width: about how wide an episode is drawn, in pixels; frames are enlarged without blur.
 
     Raises:

@@ -41,15 +41,12 @@ def write_report(
     dark mode.
 
     Args:
-        folder: where; other files in it are left alone.
         results: what was measured, by heading. A number or an interval
             (:class:`~ifo_grounding.stats.Rate` and its like) is shown large; a mapping becomes a
             table of two columns, a list of mappings a table with a column per key, a text a
             paragraph.
         pictures: by heading: matplotlib figures, the bytes of PNGs, GIFs or JPEGs, or lists of
             :class:`~ifo_grounding.report.Captioned`.
-        title: of the page.
-        summary: a sentence below the title.
 
     Returns:
         Path of the page.

@@ -142,11 +142,6 @@ def seeds_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
     return text_table(rows)
 
 
-def results_table(results: Mapping[str, Any]) -> str:
-    """Return :func:`results_rows` as a table for the terminal."""
-    return text_table(results_rows(results))
-
-
 def restored(kind: type[Measured], values: Mapping[str, Any]) -> Measured:
     """Return a measurement that was written as plain values, where None is undefined.
 
@@ -182,11 +177,7 @@ def by_scene(outcomes: Tensor) -> dict[str, Any]:
 
 
 def unpacked(runs: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
-    """Return the success of a policy on every scene of several runs, bool [runs, scenes].
-
-    Args:
-        runs: result files, whose scenes are the same.
-        name: of the policy in their results.
+    """Return the success of a policy on every scene of several result files, bool [runs, scenes].
 
     >>> import torch
     >>> found = by_scene(torch.tensor([True, False, True]))

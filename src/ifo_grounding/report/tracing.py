@@ -40,7 +40,6 @@ def trace_animation(trace: Trace, *, actions: Sequence[str] = keys.ACTIONS) -> b
 
     Args:
         trace: from :func:`~ifo_grounding.evaluation.trace_episode`.
-        actions: names of the actions, by default those of the grid.
 
     Raises:
         UserError: where there is not one name for each action.

@@ -31,6 +31,8 @@ PATIENCE = 1000
 """Draws for each scene after which a layout counts as unable to hold a suitable goal."""
 FEWEST = 4096
 """Scenes that are drawn at once at least: fewer take as long."""
+BLOCKS_KEPT = 16
+"""Blocks of so many scenes that a stream remembers."""
 
 
 class Scene(TensorClass):
@@ -203,3 +205,37 @@ def propose_goal(state: WorldState, task: int, lots: Lots) -> Goal:
         side=side,
         batch_size=nothing.shape,
     )
+
+
+class SceneStream:
+    """The scenes of one seed, each of which can be drawn again by its number.
+
+    >>> stream = SceneStream(SceneOptions("pick"), seed=0)
+    >>> scenes = stream.scenes(torch.tensor([5, 2000]))
+    >>> scenes.instruction.shape, scenes.wanted.verdict.tolist()
+    (torch.Size([2, 16]), [0, 0])
+    """
+
+    def __init__(
+        self, options: SceneOptions, seed: int, device: torch.device | str | None = None
+    ) -> None:
+        self.options, self.seed, self.device = options, seed, torch.device(device or "cpu")
+        self._blocks: dict[int, Scene] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_blocks": {}}  # a copy draws its scenes again
+
+    def scenes(self, numbers: Tensor) -> Scene:
+        """Return the scenes with the given numbers, int64 [N] from 0 on."""
+        blocks, which = (numbers // FEWEST).unique(return_inverse=True)
+        parts: list[Any] = [self._block(block) for block in blocks.tolist() or [0]]
+        every: Any = parts[0] if len(parts) == 1 else torch.cat(parts)
+        return every[which * FEWEST + numbers % FEWEST]
+
+    def _block(self, block: int) -> Scene:
+        if block not in self._blocks:
+            if len(self._blocks) == BLOCKS_KEPT:
+                del self._blocks[next(iter(self._blocks))]
+            numbers = torch.arange(block * FEWEST, (block + 1) * FEWEST, device=self.device)
+            self._blocks[block] = draw_scenes(self.options, self.seed, numbers)
+        return self._blocks[block]

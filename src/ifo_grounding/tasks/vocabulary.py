@@ -79,7 +79,6 @@ class Vocabulary:
         """Turn sentences into token ids, int64 [N, length].
 
         Args:
-            sentences: one or several.
             skip_unknown: whether to leave out what the vocabulary has no place for: unknown words,
                 of which a sentence may consist, and those beyond its length.
 
@@ -135,7 +134,6 @@ def words_of(sentence: str, punctuation: bool = False) -> list[str]:
     accent are one character (NFC), however they were written.
 
     Args:
-        sentence: any text.
         punctuation: whether the punctuation around words stays, too.
 
     >>> words_of("  Pick-up Ann's RED ball, then stop ...")

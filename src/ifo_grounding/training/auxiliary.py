@@ -50,7 +50,6 @@ class AdversarialUpdates:
     Demonstrated actions are positives, the policy's own actions are negatives.
 
     Args:
-        demonstrations: labelled ones.
         steps: gradient steps after each iteration of self-examination.
         batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
     """

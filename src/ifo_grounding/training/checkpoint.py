@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, first_line
 from ifo_grounding.files import atomic_write, regular_file, unwritable
 
 FORMAT = "ifo-grounding checkpoint 2"
@@ -69,7 +69,6 @@ class Checkpoint:
     """One file that holds the state of named parts of a training loop.
 
     Args:
-        path: the file.
         settings: what decides the result; a checkpoint of other settings is refused.
         parts: objects with ``state_dict`` and ``load_state_dict``.
 
@@ -102,7 +101,7 @@ class Checkpoint:
             with atomic_write(self.path) as temporary:
                 torch.save(content, temporary)
         except (OSError, RuntimeError) as error:  # PyTorch's writer raises a RuntimeError
-            raise unwritable(self.path, _reason(error)) from error
+            raise unwritable(self.path, first_line(error)) from error
 
     def load(self) -> dict[str, Any] | None:
         """Restore all parts and return the progress, or None where there is no checkpoint.
@@ -127,8 +126,8 @@ class Checkpoint:
                 part.load_state_dict(content["parts"][name])
             except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 raise UserError(
-                    f"{self.path} holds another {name} than this run has ({_reason(error)}): give "
-                    f"this run another name, {over}"
+                    f"{self.path} holds another {name} than this run has ({first_line(error)}): "
+                    f"give this run another name, {over}"
                 ) from error
         self._begun = time.monotonic() - content["seconds"]
         return content["progress"]
@@ -145,19 +144,14 @@ def spent(path: Path) -> float:
 def _read(path: Path) -> dict[str, Any]:
     """Return what a checkpoint file holds."""
     try:
-        with zipfile.ZipFile(
-            regular_file(path)
-        ) as archive:  # PyTorch does not compare its checksums
-            if damaged := archive.testzip():
+        with zipfile.ZipFile(regular_file(path)) as archive:
+            if damaged := archive.testzip():  # PyTorch does not compare checksums
                 raise zipfile.BadZipFile(f"the checksum of {damaged} is another")
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # flipped bits raise whatever the reader stumbles over
-        raise UserError(f"{path} is damaged ({_reason(error)}): delete it to start over") from None
+        why = first_line(error)
+        raise UserError(f"{path} is damaged ({why}): delete it to start over") from None
     known = isinstance(content, dict) and content.get("format") == FORMAT
     if not known or any(not isinstance(content.get(k), kind) for k, kind in HELD.items()):
         raise UserError(f"{path} is no checkpoint of this version: delete it to start over")
     return content
-
-
-def _reason(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]

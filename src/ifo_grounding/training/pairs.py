@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
@@ -17,8 +19,6 @@ from ifo_grounding.transforms.choosing import PoolScorer
 from ifo_grounding.transforms.sampler import NothingSuitableError
 from ifo_grounding.transforms.starts import FRAME_HASH, frame_hash
 
-SCORE = "score"
-"""Key of the probability that a stored pair is suitable, float32 [N, 1]."""
 PATIENCE, LEAST_SERVED = 100, 0.002
 """Resets from which on the search is given up where a smaller share of states has a pair."""
 
@@ -29,11 +29,9 @@ def select_pairs(
     pool: Tensor,
     n: int,
     *,
-    threshold: float = 0.8,
-    candidates: int = 64,
-    choose: str = "random",
     seed: int = 0,
     progress: bool = False,
+    **options: Any,
 ) -> TensorDict:
     """Store ``n`` scenes of a simulator, each with a suitable instruction (5K or 10K in the paper).
 
@@ -44,13 +42,12 @@ def select_pairs(
         env: simulator without instructions, with ``scene_numbers`` of its running episodes.
         classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
         pool: token ids of the instructions, int64 [N, L]; duplicates count once.
-        threshold: least probability of a suitable pair.
-        candidates: instructions scored for each state; the whole pool if it is smaller.
-        choose: ``random`` among the suitable ones, or the ``best``.
+        options: of :meth:`ifo_grounding.transforms.PoolScorer.choose`: ``threshold``,
+            ``candidates``, ``choose``.
 
     Returns:
-        TensorDict [n] on the CPU: ``scene`` int64 [n, 1], ``instruction`` int64 [n, L], ``score``
-        float32 [n, 1], ``frame_hash`` int64 [n, 1].
+        TensorDict [n] on the CPU: ``scene`` int64 [n, 1], ``instruction`` int64 [n, L] and
+        ``frame_hash`` int64 [n, 1].
 
     Raises:
         UserError: on a simulator that does not number its scenes, or an impossible option.
@@ -80,27 +77,20 @@ def select_pairs(
     with progress_bar(total=n, desc="pairs", shown=progress) as bar:
         while count < n:
             pixels = env.reset()[PIXELS].flatten(0, -4)
-            choices = scorer.choose(
-                pixels,
-                threshold=threshold,
-                candidates=candidates,
-                choose=choose,
-                generator=source,
-            )
+            choices = scorer.choose(pixels, generator=source, **options)
             rows = (choices.chosen >= 0).nonzero().squeeze(-1)[: n - count]
             seen, count, resets = seen + len(pixels), count + len(rows), resets + 1
             best_score = max(best_score, float(choices.score.max()))
             if resets >= PATIENCE and count < min(n, LEAST_SERVED * seen):
                 raise NothingSuitableError(
-                    f"only {count:,} of {seen:,} states got an instruction that scored above "
-                    f"{threshold} (best score seen: {best_score:.2f}), too few to find {n:,} "
-                    "pairs: lower threshold, raise candidates, or train the classifier, or the "
-                    "policy that it was initialised from, longer"
+                    f"only {count:,} of {seen:,} states got an instruction that scored above the "
+                    f"threshold (best score seen: {best_score:.2f}), too few to find {n:,} pairs: "
+                    "lower threshold, raise candidates, or train the classifier, or the policy "
+                    "that it was initialised from, longer"
                 )
             pairs = {
                 SCENE: env.scene_numbers.flatten()[rows].unsqueeze(-1),
                 INSTRUCTION: scorer.pool.to(rows.device)[choices.chosen[rows]],
-                SCORE: choices.score[rows].unsqueeze(-1),
                 FRAME_HASH: frame_hash(pixels[rows]).unsqueeze(-1),
             }
             found.append(TensorDict(pairs, [len(rows)]).cpu())

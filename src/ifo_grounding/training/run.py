@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import importlib.util
 import os
 import platform
 import shutil
@@ -17,7 +16,7 @@ from typing import Any
 
 import torch
 
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, first_line, optional
 from ifo_grounding.files import (
     atomic_write,
     home,
@@ -68,11 +67,8 @@ class Run:
 
     def __init__(self, name: str | Path, logger: str = "csv") -> None:
         check_choice("logger", logger, LOGGERS)
-        if logger in EXTRAS and importlib.util.find_spec(logger) is None:
-            raise UserError(
-                f"logger={logger} needs the extra of that name: "
-                f"pip install 'ifo-grounding[{logger}]', or use logger=csv"
-            )
+        if logger in EXTRAS:
+            optional(logger, extra=logger)
         self.name = str(name)  # options read a name of digits as a number
         if not self.name:
             raise UserError("a run needs a name, or the path of its folder")
@@ -150,7 +146,7 @@ class Run:
                 return {str(name): value for name, value in options.items()}
             why = "it holds no options"
         except Exception as error:  # of YAML, of OmegaConf, of the file
-            why = str(error).splitlines()[0]
+            why = first_line(error)
         raise UserError(f"{path} is damaged ({why}): restore it, or give another run=")
 
     def begin(self, options: dict[str, Any], free: Collection[str] = ()) -> None:

@@ -67,9 +67,6 @@ class EarlyStopping(BestWeights):
         loss: the LossModule that is trained; it is measured in eval mode.
         buffer: held-out samples, all of which are measured.
 
-    Raises:
-        UserError: where the buffer is empty.
-
     >>> from ifo_grounding.data import Demonstrations, first_frame_buffer
     >>> from ifo_grounding.networks import make_instruction_classifier
     >>> from ifo_grounding.objectives import InstructionLoss
@@ -111,9 +108,6 @@ class HeldOutAccuracy:
     Args:
         policy: acts greedily.
         buffer: held-out transitions, as :func:`~ifo_grounding.data.labelled_buffer` makes them.
-
-    Raises:
-        UserError: where the buffer is empty.
 
     >>> from ifo_grounding.data import labelled_buffer, record_demonstrations
     >>> from ifo_grounding.networks import make_policy
@@ -173,7 +167,6 @@ class BestCheckpoint(BestWeights):
         env: batched; its transforms choose instructions and pay learned rewards.
         policy: plays greedily.
         episodes: how many are played for a measure.
-        max_steps: most actions of an episode.
         margin: standard errors by which a policy has to be better to be kept.
         held_out: weights whose accuracy there is clearly worse than at first are never kept.
         by_accuracy: measure the accuracy of ``held_out`` instead of the learned return.

@@ -103,11 +103,8 @@ def self_examine(
     Returns the metrics of each iteration.
 
     Args:
-        env: batched, without true instructions and rewards; its transforms choose instructions
-            and write ``("next", "learned_reward")``.
-        policy: the phase-1 policy, a ``ProbabilisticActor``.
-        value: estimates the learned return.
-        options: for :func:`improve_policy`: ``seed`` and what else it takes.
+        env: without true instructions and rewards, otherwise as :func:`improve_policy` has it, and
+            so are all other arguments.
 
     Raises:
         UserError: where the env exposes its true state or its own instructions, and as of
@@ -144,14 +141,11 @@ def improve_policy(
         env: batched; its transforms write ``("next", "learned_reward")`` and, where it has none,
             instructions. They are seeded anew each iteration, but for those inside the workers of a
             ``SerialEnv`` or ``ParallelEnv``. What the env itself pays is not read.
-        policy: a ``ProbabilisticActor``.
-        value: estimates the learned return.
         seed: all randomness is a function of it and of the iteration, which starts from a reset.
         adversarial: trains the reward model on, with the steps of each iteration.
         held_out: policies that are clearly less accurate there than phase 1 are not selected. With
             ``adversarial`` the most accurate policy is the best.
         checkpoint: file to continue from, to the same result, and to save to.
-        checkpoint_seconds: least time between two checkpoints.
         log: gets the metrics of each iteration and its number.
         callback: gets the iteration, returns further metrics; the place for audits.
 

@@ -113,7 +113,6 @@ def fit(
         name: names the stream of randomness, and the progress bar.
         checkpoint: file to continue from, to the same result, and to save to; not with a buffer
             that prefetches or has a generator of its own.
-        checkpoint_seconds: least time between two checkpoints.
         log: gets the mean metrics of each iteration and the step.
         held_out: an :class:`~ifo_grounding.training.EarlyStopping` or a
             :class:`~ifo_grounding.training.BestCheckpoint`, whose best weights are kept in the end.

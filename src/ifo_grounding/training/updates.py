@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, first_line
 from ifo_grounding.networks.warm_start import inherited
 
 Update = Callable[[TensorDictBase], dict[str, Tensor]]
@@ -77,9 +77,6 @@ class CapturedUpdate:
     Args:
         update: maps a batch to metrics, by the same kernels whatever the batch holds, reads nothing
             back to the CPU, and steps an optimizer prepared by :func:`let_capture`.
-
-    Raises:
-        UserError: where the update cannot be captured.
     """
 
     def __init__(self, update: Update) -> None:
@@ -101,9 +98,9 @@ class CapturedUpdate:
                     self.metrics = self.update(self.batch)
             except RuntimeError as error:
                 raise UserError(
-                    f"this step cannot be one CUDA graph ({str(error).splitlines()[0]}): its "
-                    "network reads something back, or computes other shapes for other batches; "
-                    "pass cudagraph=False"
+                    f"this step cannot be one CUDA graph ({first_line(error)}): its network reads "
+                    "something back, or computes other shapes for other batches; pass "
+                    "cudagraph=False"
                 ) from error
         else:
             self.batch.update_(batch)

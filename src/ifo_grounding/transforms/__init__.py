@@ -4,7 +4,7 @@ from ifo_grounding.transforms.choosing import Choices, PoolScorer
 from ifo_grounding.transforms.goal import GoalReward
 from ifo_grounding.transforms.reward import LearnedReward
 from ifo_grounding.transforms.sampler import InstructionSampler, NothingSuitableError
-from ifo_grounding.transforms.starts import StartingPairs, frame_hash
+from ifo_grounding.transforms.starts import StartingPairs
 
 __all__ = [
     "Choices",
@@ -14,5 +14,4 @@ __all__ = [
     "NothingSuitableError",
     "PoolScorer",
     "StartingPairs",
-    "frame_hash",
 ]

@@ -69,8 +69,6 @@ class InstructionTransform(EpisodeTransform):
 
     Args:
         tokens: all instructions that may be written, int64 [N, L].
-        in_keys: key of the image.
-        out_keys: key of the instruction.
     """
 
     tokens: Tensor

@@ -6,21 +6,18 @@ import math
 from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDict, unravel_key
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from tensordict.utils import NestedKey
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from ifo_grounding.errors import UserError, at_least_one, check_choice, share
-from ifo_grounding.keys import PIXELS, SUITABILITY
-from ifo_grounding.modules import device_of, evaluating, output_key
+from ifo_grounding.keys import SUITABILITY
+from ifo_grounding.modules import device_of, evaluating, halves_of, output_key
 from ifo_grounding.transforms.base import check_pool, flat_logit
 
 CHOICES = ("random", "best")
 AT_ONCE = 2048
 """States, instructions or pairs that pass a network together, to bound memory."""
-PARTS = ("encode_scenes", "encode_instruction", "score_candidates")
-"""Methods of a network that encodes states and instructions separately."""
 FIRST_LOOK = 4
 """Candidates of each state that are scored first; then twice as many, and so on."""
 
@@ -37,18 +34,15 @@ class Choices(NamedTuple):
 class PoolScorer:
     """Scores pairs of a state and an instruction of a pool, and chooses among them.
 
-    Where the classifier's network has ``encode_scenes``, ``encode_instruction`` and
-    ``score_candidates``, each state and each instruction is encoded once: encodings of the pool are
-    kept until a weight changes. Any other TensorDictModule is called on whole pairs.
+    A classifier of the library encodes each state and each instruction once
+    (:func:`~ifo_grounding.modules.halves_of`); encodings of the pool are kept until a weight
+    changes.
 
     Args:
-        classifier: TensorDictModule from (pixels, instruction) to one logit.
+        classifier: TensorDictModule from (pixels, instruction), in this order, to one logit.
         pool: token ids, int64 [N, L].
-        pixels_key: key of the images where the classifier's inputs are in another order.
 
-    Raises:
-        UserError: on a classifier or a pool of another form.
-
+    >>> from tensordict.nn import TensorDictModule
     >>> def same(pixels, instruction):  # suitable where the first token is the brightness
     ...     equal = pixels.flatten(1)[:, :1] == instruction[:, :1]
     ...     return equal * 8.0 - 4.0
@@ -59,15 +53,12 @@ class PoolScorer:
     [2, -1, 0]
     """
 
-    def __init__(
-        self, classifier: TensorDictModuleBase, pool: Tensor, pixels_key: NestedKey = PIXELS
-    ) -> None:
+    def __init__(self, classifier: TensorDictModuleBase, pool: Tensor) -> None:
         self.logit_key = output_key(classifier, SUITABILITY)
-        inputs = [unravel_key(key) for key in classifier.in_keys]
-        if len(inputs) != 2:
-            raise UserError(f"a classifier reads pixels and an instruction, not {inputs}")
-        swapped = inputs[1] in (pixels_key, PIXELS) and inputs[0] not in (pixels_key, PIXELS)
-        self.pixels_key, self.instruction_key = reversed(inputs) if swapped else inputs
+        if len(classifier.in_keys) != 2:
+            raise UserError(
+                f"a classifier reads pixels and an instruction, not {classifier.in_keys}"
+            )
         self.classifier = classifier
         self.pool = check_pool(pool)
         self.scored = 0
@@ -75,20 +66,14 @@ class PoolScorer:
         self._weights: list[Tensor] = []
 
     @property
-    def network(self) -> Any | None:
-        """The classifier's network where it encodes states and instructions separately."""
-        if not isinstance(self.classifier, TensorDictModule):
-            return None
-        network = self.classifier.module
-        return network if all(callable(getattr(network, part, None)) for part in PARTS) else None
+    def halves(self) -> Any:
+        """What encodes states and instructions apart, and scores them."""
+        return halves_of(self.classifier, self.logit_key)
 
     def encode(self, pixels: Tensor) -> Any:
-        """Encode states [B, ...] for :meth:`score`, or return them where nothing is split."""
-        device = device_of(self.classifier) or pixels.device
-        if (network := self.network) is None:
-            return pixels.to(device)
+        """Encode states [B, ...] for :meth:`score`."""
         with evaluating(self.classifier):
-            return network.encode_scenes(pixels.to(device))
+            return self.halves.encode_scenes(pixels.to(device_of(self.classifier) or pixels.device))
 
     def score(self, states: Any, index: Tensor, words: Tensor | None = None) -> Tensor:
         """Score candidates.
@@ -103,32 +88,20 @@ class PoolScorer:
         """
         self.scored += index.numel()
         device = device_of(self.classifier) or index.device
-        # Encoded scenes that are no tensor bound their memory themselves, and gain from many rows.
-        whole = not isinstance(states, Tensor)
-        rows = max(1, len(index) if whole else AT_ONCE // max(1, index.shape[1]))
+        # Encoded scenes that are no tensors bound their memory themselves, and gain from many rows.
+        bounded = not isinstance(states, Tensor | TensorDictBase)
+        rows = max(1, len(index) if bounded else AT_ONCE // max(1, index.shape[1]))
+        halves, parts = self.halves, []
         with evaluating(self.classifier):
-            some = [slice(begin, begin + rows) for begin in range(0, len(index), rows)]
             words = self.words(device) if words is None else words
-            parts = [self._candidates(states[part], index[part].to(device), words) for part in some]
+            for begin in range(0, len(index), rows):
+                some = index[begin : begin + rows].to(device)
+                logit = halves.score_candidates(states[begin : begin + rows], words, some)
+                parts.append(flat_logit(logit, some.numel(), self.logit_key).view(some.shape))
         return torch.cat(parts).to(index.device)
 
-    def _candidates(self, states: Any, index: Tensor, words: Tensor | None) -> Tensor:
-        if (network := self.network) is not None:
-            logit = network.score_candidates(states, words, index)
-        else:
-            pairs = TensorDict({}, batch_size=[index.numel()], device=index.device)
-            pairs[self.pixels_key] = states.repeat_interleave(index.shape[1], 0)
-            pairs[self.instruction_key] = self.pool.to(index.device)[index.flatten()]
-            logit = self.classifier(pairs).get(self.logit_key)
-        return flat_logit(logit, index.numel(), self.logit_key).view(index.shape)
-
-    def words(self, device: torch.device) -> Tensor | None:
-        """Encode the pool, or return what was kept if no weight has changed since.
-
-        None where the network does not encode instructions apart.
-        """
-        if (network := self.network) is None:
-            return None
+    def words(self, device: torch.device) -> Tensor:
+        """Encode the pool, or return what was kept if no weight has changed since."""
         weights = [*self.classifier.parameters(), *self.classifier.buffers()]
         # Values are compared, not version counters: updates through `.data` or from another
         # process do not count.
@@ -139,7 +112,8 @@ class PoolScorer:
         if self._encodings is None or not fresh or self._encodings.device != device:
             self._weights = [weight.detach().clone() for weight in weights]
             chunks = self.pool.to(device).split(AT_ONCE)
-            self._encodings = torch.cat([network.encode_instruction(chunk) for chunk in chunks])
+            encode = self.halves.encode_instruction
+            self._encodings = torch.cat([encode(chunk) for chunk in chunks])
         return self._encodings
 
     def choose(
@@ -209,8 +183,7 @@ class PoolScorer:
 def check_options(threshold: float, candidates: int, choose: str) -> None:
     """Raise :class:`UserError` where an option of the choice is impossible."""
     check_choice("choose", choose, CHOICES)
-    if share("threshold", threshold) == 1:
-        raise UserError(f"threshold is a probability in [0, 1), got {threshold}")
+    share("threshold", threshold, full=False)
     at_least_one("candidates", candidates)
 
 

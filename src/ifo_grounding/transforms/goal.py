@@ -23,8 +23,7 @@ class GoalReward(RewardTransform):
     An extension of the paper. The goal classifier sees the first image of the episode, the image
     after the step, and the instruction; it assumes that demonstrations end in success. Steps before
     the stop are paid nothing, and so are episodes that are cut. The transform carries the first
-    image as ``initial_pixels``. The true reward, the classifier's mode and steps that were
-    collected before are treated as by :class:`~ifo_grounding.transforms.LearnedReward`.
+    image as ``initial_pixels``. All else is as of :class:`~ifo_grounding.transforms.LearnedReward`.
 
     Args:
         goal_classifier: TensorDictModule to a logit from ``pixels``, the image after the step, and
@@ -35,12 +34,10 @@ class GoalReward(RewardTransform):
             least this, and on an environment the episode terminates there.
         in_keys: entries of a step that are read, in the order of the classifier's own ``in_keys``
             and then the action; by default those themselves and ``action``.
-        out_keys: key of the reward, below ``next``; by default ``learned_reward``.
 
     Raises:
-        UserError: on a classifier, keys, a stop or an arrival of another form; where a later
-            transform changes what the classifier reads, or the environment has no such stop or
-            already pays a reward of that name.
+        UserError: as of :class:`~ifo_grounding.transforms.LearnedReward`, on a stop or an arrival
+            of another form, and where the environment has no such stop.
 
     >>> from tensordict import TensorDict
     >>> from tensordict.nn import TensorDictModule

@@ -25,10 +25,7 @@ class RewardTransform(EpisodeTransform):
 
     Args:
         model: writes a logit of the name ``logit``.
-        in_keys: entries of a step that are read, in the order of the model's own ``in_keys`` and of
-            ``also``; by default those themselves.
-        out_keys: key of the reward, below ``next``.
-        also: names of what is read besides the model's ``in_keys``.
+        also: names of what is read besides the model's ``in_keys``, and after it.
     """
 
     arrival: float | None = None

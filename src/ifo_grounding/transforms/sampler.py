@@ -36,11 +36,8 @@ class InstructionSampler(InstructionTransform):
     Args:
         classifier: TensorDictModule from (pixels, instruction) to the logit of suitability.
         pool: token ids of the instructions, int64 [N, L]; duplicates count once.
-        threshold: least probability of a suitable pair.
-        candidates: instructions drawn for each state; the whole pool if it is smaller.
-        choose: ``random`` among the suitable ones (then only as many are scored as it takes to find
-            one), or the ``best``.
-        max_tries: states drawn for one row before giving up.
+        max_tries: states drawn for one row before giving up; ``threshold``, ``candidates`` and
+            ``choose`` are those of :meth:`PoolScorer.choose`.
 
     Raises:
         UserError: on an option or a pool of another form, on an environment that exposes its true
@@ -79,7 +76,7 @@ class InstructionSampler(InstructionTransform):
         self.options["choose"] = choose
         check_options(**self.options)
         self.max_tries = at_least_one("max_tries", max_tries)
-        self.scorer = PoolScorer(classifier, self.tokens, self.in_keys[0])
+        self.scorer = PoolScorer(classifier, self.tokens)
         self.classifier = classifier
         self.set_seed(seed)
         self._clear_stats()

@@ -59,7 +59,7 @@ class StartingPairs(InstructionTransform):
     ) -> None:
         missing = [key for key in (SCENE, INSTRUCTION) if pairs.get(key, None) is None]
         if missing:
-            raise UserError(f"pairs lack {missing}: they come from select_pairs or load_pairs")
+            raise UserError(f"pairs lack {missing}: they come from select_pairs")
         super().__init__(pairs[INSTRUCTION], in_keys, out_keys)
         scene, hashes = pairs[SCENE], pairs.get(FRAME_HASH, None)
         if scene.is_floating_point() or scene.numel() != len(self.tokens):

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ifo_grounding.errors import UserError, whole
+from ifo_grounding.errors import UserError, share, whole
 from ifo_grounding.seeding import Lots
 from ifo_grounding.world.state import N_BOXES, N_KINDS, WorldState
 
@@ -45,8 +45,7 @@ class Layout:
                 f"{self.objects[1]} objects and {self.boxes[1]} boxes do not fit on "
                 f"{self.size}x{self.size} cells: ask for fewer or a larger grid"
             )
-        if not 0.0 <= self.inside <= 1.0:
-            raise UserError(f"inside must be a probability, got {self.inside}")
+        share("inside", self.inside)
         if not set(range(1, N_KINDS + 1)) - set(self.excluded_kinds):
             raise UserError("excluded_kinds leaves no kind of object")
 

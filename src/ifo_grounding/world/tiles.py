@@ -93,9 +93,6 @@ class Canvas:
 
     Its pictures are those of :func:`render`.
 
-    Args:
-        tile_size: pixels along one side of a cell: 8, 16 or 32.
-
     >>> canvas, state = Canvas(), WorldState.empty(2, size=6)
     >>> bool((canvas.draw(state) == render(state)).all())
     True

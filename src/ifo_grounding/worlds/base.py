@@ -33,9 +33,6 @@ class Oracle(Protocol):
     ) -> str:
         """Say whether an instruction suits a scene or a state, ``suitable``, or why not."""
 
-    def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
-        """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
-
 
 class World(ABC):
     """A world that every recipe runs in.
@@ -81,13 +78,9 @@ class World(ABC):
         """Return worlds with an instruction, which pay success: for evaluation alone.
 
         Args:
-            num_envs: worlds side by side.
-            seed: of the stream of scenes.
-            stream: ``training``, ``validation`` or ``evaluation``.
             split: which instructions, where a world knows several splits.
             waits: whether an episode whose instruction is fulfilled goes on until the policy stops,
                 so that a learned reward at the stop can be compared with success.
-            device: where tensors go.
         """
 
     def demonstrate(

@@ -51,9 +51,6 @@ class Grid(World):
     """Probability that an object begins in a box."""
 
     def __post_init__(self) -> None:
-        for name in ("objects", "boxes"):
-            if len(getattr(self, name)) != 2:
-                raise UserError(f"world.{name} is two numbers, got {list(getattr(self, name))}")
         grammar(self.task)
         self.layout = Layout(self.size, (*self.objects,), (*self.boxes,), self.inside)
         self.actions, self.stop_action, self.vocabulary = keys.ACTIONS, keys.STOP, VOCABULARY
@@ -116,12 +113,6 @@ class Grid(World):
             state = env.truth.state
         goal = grammar(self.task).parse_tokens(instruction.reshape(1, -1))
         return REASONS[int(verdict(state, goal))]
-
-    def instruction_cases(self, classifier: Any, pool: Tensor, **options: Any) -> Any:
-        """Draw states with the instructions that are chosen for them (paper, Figure 5)."""
-        from ifo_grounding.report import instruction_cases  # draws: slow to import
-
-        return instruction_cases(classifier, self.task, pool, **self.scenes(**options))
 
 
 @dataclass

@@ -12,7 +12,6 @@ from hydra.utils import get_method
 from ifo_grounding.envs import GymnasiumEnv, from_gymnasium
 from ifo_grounding.envs.reading import numbered_actions
 from ifo_grounding.errors import UserError
-from ifo_grounding.keys import action_names
 from ifo_grounding.worlds.base import World
 
 
@@ -48,7 +47,7 @@ class Gymnasium(World):
         world = self._maker()()
         count, self.stop_action = numbered_actions(world.action_space, self.stop)
         world.close()
-        self.actions = self.names or action_names(count)
+        self.actions = self.names or [*map(str, range(count))]
 
     def simulator(self, num_envs: int, **options: Any) -> GymnasiumEnv:
         """Return worlds without instructions and rewards; see :class:`World`."""
