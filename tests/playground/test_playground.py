@@ -1,5 +1,7 @@
 """What stands behind the page: an agent that is told things, a lesson, a look at recordings."""
 
+import importlib
+
 import pytest
 import torch
 
@@ -10,6 +12,7 @@ from ifo_grounding.playground import Agent, Lesson, Source, Training, Visit, loo
 from ifo_grounding.tasks import grammar
 from ifo_grounding.world import WorldState, kind
 from ifo_grounding.worlds import Grid, OpenGrid
+from importing import recipes_importable
 
 MOVE = "ifo-grounding/move"
 UP, RIGHT, DOWN, LEFT, PICK, STOP = range(6)
@@ -114,3 +117,25 @@ def test_visits_are_apart_and_say_what_is_wrong(agent, tmp_path):
         first.open(str(tmp_path))
     with pytest.raises(UserError, match="nothing trained yet"):
         first.show()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_what_no_template_names_is_learned_from_twenty_demonstrations(tmp_path, monkeypatch):
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path))
+    corners = {"go to the top left corner": (UP, LEFT, 0), "go down right": (DOWN, RIGHT, 35)}
+    lesson = Lesson(OpenGrid(), seed=0)
+    for said, (along, across, _) in corners.items():
+        for _ in range(10):
+            for action in (*5 * [along], *5 * [across], STOP):
+                lesson.act(action, said)
+    training = Training(lesson, Agent.teach)
+    assert training.process.wait() == 0, training.now
+    with recipes_importable():
+        agent = importlib.import_module("play").load(training.run.name)
+    for said, (*_, corner) in corners.items():
+        ended = [agent.play(scene, 1, said) for scene in range(60)]
+        for phase in agent.policies:
+            there = [int(one[phase].states[-1].arm) == corner for one in ended]
+            print(said, phase, sum(there))
+            assert sum(there) > 45
