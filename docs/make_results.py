@@ -121,6 +121,8 @@ ACCESS = {
     "expert": ("", "", "the demonstrator"),
 }
 """Methods of Table 1: whether they may read true actions and step from demonstrations' states."""
+PEERS = ("ours", "imitation", "imitation, own reward")
+"""What learns GAIL in `benchmarks/gail.py`."""
 
 
 def by_method(task: str, number: int) -> dict[str, Runs]:
@@ -163,6 +165,17 @@ def shown_p(value: float) -> str:
     return f"{value:.2g}" if value >= 1e-4 else "< 0.0001"
 
 
+def peer_rows() -> list[Row]:
+    """Return how often our GAIL and that of another package succeed, by frames."""
+    runs = read("peers", lambda _: "gail")["gail"]
+    measured = {int(name.rsplit(", ", 1)[1]) for name in runs[0]["results"]}
+    return [
+        {"frames": f"{frames:,}", "seeds": len(runs)}
+        | {name: success(runs, f"{name}, {frames}") for name in PEERS}
+        for frames in sorted(measured)
+    ]
+
+
 def baseline_curves(task: str, number: int) -> bytes:
     """Draw the success on validation scenes of each method that learns by policy gradient."""
     history: dict[float, dict[str, float]] = {}
@@ -195,6 +208,7 @@ def tables() -> dict[str, str]:
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
         "baselines": baseline_rows("move", 2000),
+        "peers": peer_rows(),
     }
     return {name: markdown_table(rows) for name, rows in found.items()}
 
