@@ -1,5 +1,6 @@
 """Imitate the labelled demonstrations: phase 1, which is BCO (paper, 1st-phase)."""
 
+from dataclasses import replace
 from typing import Any
 
 from _shared import (
@@ -23,6 +24,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.training import EarlyStopping, Run, Stage, Trial, successive_halving, trial_seed
+from ifo_grounding.training.parallel import rank, together
 
 
 def imitate(options: Options) -> dict:
@@ -105,7 +107,9 @@ def split_transitions(
 
 @recipe_main
 def main(options: Options) -> None:
-    tell(imitate(options))
+    with together(options.run, options.device) as (run, device):
+        shown = options.progress and not rank()
+        tell(imitate(replace(options, run=run, device=device, progress=shown)))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from ifo_grounding.modules import beside, device_of
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.checkpoint import Checkpoint
 from ifo_grounding.training.loop import Log, Loop, Metrics
+from ifo_grounding.training.parallel import averaged, averaging, processes, samples
 from ifo_grounding.training.selection import BestWeights
 from ifo_grounding.training.updates import (
     CapturedUpdate,
@@ -104,6 +105,9 @@ def fit(
 ) -> list[Metrics]:
     """Minimise a loss module over samples of a replay buffer.
 
+    Processes that ``torchrun`` started and :func:`torch.distributed.init_process_group` joined
+    learn together: each computes the gradient of its share of a batch.
+
     Args:
         loss: a LossModule; entries of its output named ``loss_*`` are minimised, others are
             metrics. Where it has ``set_progress``, it is told the share of steps done.
@@ -152,24 +156,26 @@ def fit(
     loop = Loop(name, pause_at, saved, checkpoint_seconds, log, progress)
     same_steps = getattr(loss, "capturable", False) and isinstance(sampler, RandomSampler)
     captured = cudagraph and device.type == "cuda" and same_steps and not decay
+    captured = captured and processes() == 1
     let_capture(optimizer, captured)
+    shared = averaging(loss)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
-        return update(loss(batch), optimizer, config.grad_clip)
+        return update(shared(batch), optimizer, config.grad_clip)
 
     make_step: Update = CapturedUpdate(step) if captured else step
     for iteration in loop:
-        torch.manual_seed(derive(seed, name, iteration))
         first = iteration * config.iteration
         steps = range(first, min(first + config.iteration, config.steps))
         updates: list[dict[str, Tensor]] = []
         start = time.perf_counter()
-        for number in steps:
+        drawn = samples(buffer, config.batch_size, len(steps), derive(seed, name, iteration))
+        for number, batch in zip(steps, drawn, strict=True):
             if callable(set_progress := getattr(loss, "set_progress", None)):
                 set_progress(number / config.steps)
             set_rate(optimizer, config.lr * config.rate(number))
-            updates.append(make_step(beside(buffer.sample(config.batch_size), loss)))
-        found = means(updates)  # read once: a GPU is not waited for after each step
+            updates.append(make_step(beside(batch, loss)))
+        found = averaged(means(updates), device)  # a GPU is waited for once, not after each step
         speed = len(steps) * config.batch_size / (time.perf_counter() - start)
         metrics = {"step": float(steps.stop), **found, "samples_per_second": speed}
         done = iteration + 1
