@@ -1,5 +1,6 @@
 """Write the table of speeds: ``python docs/make_speed.py`` after ``make bench``."""
 
+from collections.abc import Collection
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -58,8 +59,8 @@ def fact_row(row: dict[str, Any]) -> dict[str, str]:
     return {"what": row["name"], "measured": "<br>".join(facts)}
 
 
-def on_device(rows: dict[str, dict[str, Any]]) -> str:
-    """Return the tables of what was measured on one device."""
+def on_device(rows: dict[str, dict[str, Any]], said: Collection[str] = ()) -> str:
+    """Return the tables of what was measured on one device, without the notes on rows ``said``."""
     made: dict[str, dict[str, None]] = {}
     for row in rows.values():
         of = row["provenance"]
@@ -71,10 +72,41 @@ def on_device(rows: dict[str, dict[str, Any]]) -> str:
     facts = [fact_row(row) for row in rows.values() if row["facts"]]
     parts += [markdown_table(part) for part in (rates[:7], rates[7:], facts) if part]
     of_note: dict[str, list[str]] = {}
-    for row in rows.values():
+    for row in (row for name, row in rows.items() if name not in said):
         of_note.setdefault(row["note"], []).append(row["name"])
     notes = [f"- {'; '.join(names)}: {note}." for note, names in of_note.items() if note]
     return "\n\n".join([*parts, "\n".join(notes)])
+
+
+def of_scale() -> str:
+    """Return the tables of what was measured of Ray and torchrun, and of the model made of it."""
+    path = RESULTS / "bench" / "scale.json"
+    found = read_json(path) if path.exists() else {"rows": {}}
+    reach = {
+        "pieces": ("pieces of a table, 2 Ray workers", "0.95 times jobs=2"),
+        "practice": ("BabyAI practice, 2 collectors", "1.6 times one process"),
+        "imitation": ("imitation, 2 processes", "1.7 times one process"),
+    }
+    lines = []
+    for name, (what, asked) in reach.items():
+        row = found["rows"].get(name)
+        ratio = between(next(iter(row["ratios"].values()))) if row else "not measured"
+        lines.append({"what": what, "asked": asked, "measured": ratio})
+    parts = [markdown_table(lines)]
+    if "growth" in found:
+        rows, limit = found["growth"]["rows"], found["growth"]["limit"]
+        of = {"frames/s": "frames/s", "bound": "if learning took no time"}
+        model = [
+            {"workers": f"{row['workers']}", **{of[name]: short(row[name]) for name in of}}
+            for row in rows[::2]
+        ]
+        text = (
+            "A model of BabyAI practice, 64 worlds a worker, 1 Gbit/s, from one process's times. "
+            "Workers wait while the learner receives and learns: it is the limit above "
+            f"{limit['frames/s']:.1f} workers or, if learning took no time, {limit['bound']:.0f}."
+        )
+        parts += [text, markdown_table(model)]
+    return "\n\n".join(parts)
 
 
 def draw_growth() -> None:
@@ -95,8 +127,9 @@ def draw_growth() -> None:
 def tables() -> dict[str, str]:
     """Return the tables of two cores, for which speeds are asked, and of a GPU."""
     there = {name: {**row, "reach": {}} for name, row in measured("cuda").items()}
-    found = {"speed": measured("cpu"), "speed-gpu": there}
-    return {name: on_device(rows) for name, rows in found.items()}
+    here = measured("cpu")
+    gpu = on_device(there, said=here)
+    return {"speed": on_device(here), "speed-gpu": gpu, "scale": of_scale()}
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.cli import recipe_main
+from ifo_grounding.cluster import Call, run_on_cluster
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home
 from ifo_grounding.tasks import TASKS
@@ -58,6 +59,8 @@ class ReproduceOptions:
     5,000."""
     jobs: int = 2
     """Chains of pieces side by side, each on one thread."""
+    ray: bool = False
+    """Whether they run on a Ray cluster instead, as many side by side as it has processors."""
     device: str = "cpu"
     """Where they are made."""
     tune: bool = False
@@ -117,6 +120,11 @@ class Piece:
     def log(self) -> Path:
         """Where its output goes."""
         return home() / "runs" / f"{self.run}.log"
+
+    def call(self) -> Call:
+        """Return it as a call that a cluster takes."""
+        gpus = int("device=cpu" not in self.arguments)
+        return Call(self.recipe, self.arguments, self.run, self.log, gpus)
 
     def make(self) -> int:
         """Make it in a process of its own, on one thread."""
@@ -256,6 +264,10 @@ def reproduce(options: ReproduceOptions) -> list[Piece]:
         return []
     failed: list[Piece] = []
     missing = [to_make(chain) for chain in chains]
+    if options.ray:
+        made = {piece.call(): piece for chain in missing for piece in chain}
+        calls = [[piece.call() for piece in chain] for chain in missing]
+        return [made[call] for call in run_on_cluster(calls, options.progress)]
     with (
         tqdm(total=sum(map(len, missing)), unit="piece", disable=not options.progress) as bar,
         ThreadPoolExecutor(options.jobs) as pool,

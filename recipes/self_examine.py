@@ -1,5 +1,7 @@
 """Self-examination: chosen instructions, a learned reward, policy gradient (paper, Algorithm 1)."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -71,6 +73,7 @@ def examine(options: Options) -> dict:
         log=stage.log(),
         callback=audit_callback(policy, reward, run, options) if world_of(options).judged else None,
         progress=options.progress,
+        workers=remote_simulators(run, options),
     )
     save_network(run, VALUE, value)
     save_network(run, POLICIES["phase2"], policy)
@@ -81,6 +84,20 @@ def paid_simulator(reward: LearnedReward | GoalReward, run: Run, options: Option
     """Return the simulator with chosen instructions and a learned reward."""
     simulator = simulator_of(options, options.self_examine.num_envs)
     return TransformedEnv(simulator, Compose(chosen_starts(run, options), reward))
+
+
+def remote_simulators(run: Run, options: Options) -> list[Callable[[], EnvBase]]:
+    """Return what makes the simulator of each worker on Ray, which has networks of its own."""
+    section, here = options.self_examine, replace(options, device="cpu")
+    if section.collectors is None:
+        return []
+    world, rows = world_of(here), section.num_envs // section.collectors
+    starts, reward = chosen_starts(run, here), learned_reward(run, here)
+
+    def make() -> EnvBase:
+        return TransformedEnv(world.simulator(rows, seed=here.seed), Compose(starts, reward))
+
+    return [make] * section.collectors
 
 
 def learned_reward(run: Run, options: Options) -> LearnedReward | GoalReward:

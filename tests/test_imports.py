@@ -15,7 +15,7 @@ from ifo_grounding import keys
 PACKAGE = Path(keys.__file__).parent
 ORDER = (
     ("keys", "texts", "errors", "seeding", "files", "machine", "allocation"),
-    ("channels", "distinct", "mosaic", "progress"),
+    ("channels", "cluster", "distinct", "mosaic", "progress"),
     ("world",),
     ("tasks",),
     ("attributes", "modules", "episodes"),

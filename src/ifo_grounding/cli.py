@@ -72,9 +72,12 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
             from ifo_grounding.options import help_text, options_of_jobs
 
             words = [word for word in sys.argv[1:] if word not in HELP]
-            found = []
-            for options in options_of_jobs(script, words):
-                if len(words) < len(sys.argv) - 1:
+            found, jobs = [], options_of_jobs(script, words)
+            help_asked = len(words) < len(sys.argv) - 1
+            if not help_asked:
+                _run_on_cluster(script, words, jobs)  # what is done is only told below
+            for options in jobs:
+                if help_asked:
                     print(help_text(script, options))
                 elif isinstance(results := function(options), dict):
                     seed = rf"(?<!\d){options.seed}(?!\d)"
@@ -85,6 +88,23 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
                 print("", seeds_table(found), sep="\n")
 
     return main
+
+
+def _run_on_cluster(script: Path, words: Sequence[str], jobs: Sequence[Any]) -> None:
+    """Run those jobs of a recipe on a Ray cluster that are to run there (``ray=true``)."""
+    from ifo_grounding.cluster import Call, run_on_cluster
+    from ifo_grounding.config import Options
+    from ifo_grounding.options import words_of_jobs
+    from ifo_grounding.training import Run
+
+    chains = []
+    for given, job in zip(words_of_jobs(words), jobs, strict=True):
+        if isinstance(job, Options) and job.ray:
+            given = [*(word for word in given if not word.startswith("ray=")), "ray=false"]
+            log = Path(f"{Run(job.run).folder.resolve()}.log")
+            chains.append([Call(script.stem, (*given,), job.run, log, int(job.device != "cpu"))])
+    if chains and (failed := run_on_cluster(chains, jobs[0].progress)):
+        raise UserError(f"ended with an error: {', '.join(str(call.log) for call in failed)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -36,7 +36,7 @@ STAGES = (
 FREE = (
     *("run", "base", "until", "results", "variant", "to", "hub", "controls.run", "references"),
     *("device", "threads", "logger", "progress", "checkpoint_seconds", "evaluate"),
-    *("method", "baseline"),
+    *("method", "baseline", "ray"),
 )
 """Options, or sections, that decide nothing of what a run learns: they may change as it goes on."""
 
@@ -176,6 +176,9 @@ class SelfExamineConfig(SelfExaminationConfig):
     """What is paid: ``action``, the paper's reward of every action, or ``goal``, at the stop."""
     num_envs: int = 256
     """Worlds side by side."""
+    collectors: int | None = None
+    """Workers of a Ray cluster that step an equal share of these worlds each, on one processor;
+    null steps them in this process."""
     pairs: int | None = None
     """Starts, each a scene with a chosen instruction, that are stored and cycled through (5,000 or
     10,000 in the paper); null chooses instructions for fresh states all the time."""
@@ -190,7 +193,11 @@ class SelfExamineConfig(SelfExaminationConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("reward", self.reward, ("action", "goal"))
-        check_range(self, "num_envs", "pairs", least=1)
+        check_range(self, "num_envs", "pairs", "collectors", least=1)
+        if self.collectors and self.num_envs % self.collectors:
+            raise UserError(f"num_envs={self.num_envs} are no {self.collectors} equal shares")
+        if self.collectors and self.pairs:
+            raise UserError("stored pairs are cycled through in one process: set collectors=null")
         check_range(self, "imitation_weight", "reward_steps", least=0)
         check_range(self, "reward_lr", above=0)
 
@@ -269,6 +276,8 @@ class Options:
     """Folder for the small file of what was measured."""
     variant: str | None = None
     """What is special about the run, for the name of that file."""
+    ray: bool = False
+    """Whether a Ray cluster runs the command, and the jobs of ``--multirun`` side by side."""
     references: bool = False
     """Whether ``demo`` also imitates the demonstrator's true actions, to compare with."""
     method: str = "ours"

@@ -81,15 +81,20 @@ def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
 
     A script with a ``conf/<its name>.yaml`` has options of its own.
     """
-    words = [word for word in arguments if word not in MULTIRUN]
     own = (script.parent / "conf" / f"{script.stem}.yaml").exists()
     with _composing(script.parent):
-        jobs = [words] if len(words) == len(arguments) else _combinations(words)
+        jobs = words_of_jobs(arguments)
         if own:
             texts = texts_of(OmegaConf.get_type(compose(script.stem)))
             given = [[quoted(word, texts, comma="text") for word in job] for job in jobs]
             return [OmegaConf.to_object(compose(script.stem, job)) for job in given]
         return [_settled(job) for job in jobs]
+
+
+def words_of_jobs(arguments: Sequence[str]) -> list[list[str]]:
+    """Return the options of each job, as they are written on a command line."""
+    words = [word for word in arguments if word not in MULTIRUN]
+    return [words] if len(words) == len(arguments) else _combinations(words)
 
 
 @contextlib.contextmanager

@@ -1,15 +1,12 @@
-"""Policy gradient on TorchRL's losses: collects steps, estimates advantages, updates."""
+"""Policy gradient on TorchRL's losses: estimates advantages, updates."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
 from torchrl.objectives.value import GAE
 
@@ -27,28 +24,16 @@ AT_ONCE = 2048
 
 
 class Learner:
-    """Holds the losses, the optimizer and the collector of one run."""
+    """Holds the losses and the optimizer of one run."""
 
     def __init__(
         self,
-        env: EnvBase,
         policy: ProbabilisticTensorDictSequential,
         value: TensorDictModuleBase,
         config: SelfExaminationConfig,
         imitation: AuxiliaryImitation | None = None,
     ) -> None:
-        self.config, self.policy, self.value, self.imitation = config, policy, value, imitation
-        self.collector = Collector(  # on a CPU a round is written over the one before
-            env,
-            policy,
-            frames_per_batch=env.batch_size.numel() * config.steps,
-            total_frames=-1,
-            reset_at_each_iter=True,
-            trust_policy=True,
-            auto_register_policy_transforms=False,
-            return_same_td=env.device is not None and env.device.type == "cpu",
-        )
-        self.batches: Iterator[TensorDictBase] = iter(self.collector)
+        self.config, self.imitation = config, imitation
         self.advantage = GAE(
             gamma=config.gamma,
             lmbda=config.lmbda,
@@ -75,10 +60,6 @@ class Learner:
         actor = [p for p in policy.parameters() if id(p) not in critic]
         self.optimizer = make_optimizer(actor, config.lr)
         self.optimizer.add_param_group({"params": list(value.parameters())})
-
-    def collect(self) -> TensorDictBase:
-        """Roll out the policy from a reset, [N, T], without the simulator's own reward."""
-        return next(self.batches).exclude((keys.NEXT, keys.REWARD), keys.REWARD)
 
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""

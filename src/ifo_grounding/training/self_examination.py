@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,10 @@ from ifo_grounding.errors import UserError, check_choice, check_numbers, check_r
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
 from ifo_grounding.training.checkpoint import Checkpoint
+from ifo_grounding.training.collection import Here, OnRay
 from ifo_grounding.training.loop import Log, Loop, Metrics
 from ifo_grounding.training.policy_gradient import Learner
-from ifo_grounding.training.reseeding import reseed, sampler_stats, stored_starts
+from ifo_grounding.training.reseeding import stored_starts
 from ifo_grounding.training.selection import BestCheckpoint, HeldOutAccuracy
 from ifo_grounding.transforms.base import exposes_state, instructs
 
@@ -132,6 +134,7 @@ def improve_policy(
     log: Log | None = None,
     callback: Callable[[int], Metrics] | None = None,
     progress: bool = False,
+    workers: Sequence[Callable[[], EnvBase]] = (),
 ) -> list[Metrics]:
     """Improve ``policy`` in place by policy gradient on learned rewards, wherever it may step.
 
@@ -148,6 +151,8 @@ def improve_policy(
         checkpoint: file to continue from, to the same result, and to save to.
         log: gets the metrics of each iteration and its number.
         callback: gets the iteration, returns further metrics; the place for audits.
+        workers: where steps are not to be collected in ``env``: each makes, in a process of a Ray
+            cluster, an environment like it that has its share of the rows.
 
     Raises:
         UserError: where the env has no instructions or no learned reward, where ``policy`` is no
@@ -160,6 +165,8 @@ def improve_policy(
             "others before an actor make one by ProbabilisticTensorDictSequential(*others, *actor)"
         )
     _check(env, config, adversarial, held_out)
+    if workers and stored_starts(env):
+        raise UserError("stored pairs are cycled through in one process: do without workers")
     policy.eval()
     value.eval()
     # Before a collector resets the env, so that it remembers the first starts.
@@ -173,8 +180,9 @@ def improve_policy(
         held_out=held_out,
         by_accuracy=adversarial is not None and config.select_every > 0,
     )
-    learner = Learner(env, policy, value, config, imitation)
-    sampler_stats(env)  # forgets the reset that a collector begins with
+    learner = Learner(policy, value, config, imitation)
+    there = policy, config.steps
+    where = OnRay(env, *there, workers) if workers else Here(env, *there)
     parts: dict[str, Any] = {"policy": policy, "value": value}
     parts |= {"optimizer": learner.optimizer, "best": best}
     if adversarial is not None:
@@ -186,25 +194,23 @@ def improve_policy(
     every = config.select_every
     if every and not loop.history:
         best.measure()
-    for iteration in loop:
-        reseed(env, derive(seed, NAME, iteration))
-        batch = learner.collect()
-        metrics: Metrics = {"step": float(iteration + 1), **summary(batch)}
-        metrics |= sampler_stats(env)
-        metrics |= learner.improve(batch, iteration)
-        release_freed_memory()  # batches of distinct pictures differ in size and would pile up
-        if adversarial:
-            metrics |= adversarial(batch)
-        done = iteration + 1
-        last = done == config.iterations
-        if every and (last or done % every == 0):
-            metrics |= best.measure()
-        if last:
-            best.restore()
-        if callback and (last or (config.evaluate_every and done % config.evaluate_every == 0)):
-            metrics |= {name: float(number) for name, number in callback(done).items()}
-        loop.add(metrics, done)
-    learner.collector.shutdown(close_env=False)  # the env is its owner's
+    with contextlib.closing(where):
+        for iteration in loop:
+            batch, counted = where.collect(derive(seed, NAME, iteration))
+            metrics: Metrics = {"step": float(iteration + 1), **summary(batch), **counted}
+            metrics |= learner.improve(batch, iteration)
+            release_freed_memory()  # batches of distinct pictures differ in size and would pile up
+            if adversarial:
+                metrics |= adversarial(batch)
+            done = iteration + 1
+            last = done == config.iterations
+            if every and (last or done % every == 0):
+                metrics |= best.measure()
+            if last:
+                best.restore()
+            if callback and (last or (config.evaluate_every and done % config.evaluate_every == 0)):
+                metrics |= {name: float(number) for name, number in callback(done).items()}
+            loop.add(metrics, done)
     return loop.history
 
 
