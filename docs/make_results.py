@@ -204,7 +204,6 @@ def tables() -> dict[str, str]:
         "few": few_rows(demo | two_hundred),
         "results": [row for (_, number), row in studied.items() if number == 200],
         "up-to-2000": [row for (_, n), row in studied.items() if n <= 2000 and n != 200],
-        "from-5000": [row for (_, number), row in studied.items() if number >= 5000],
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
         "baselines": baseline_rows("move", 2000),

@@ -29,7 +29,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS]
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 TITLED = re.compile(r'^```python title="([\w.]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 LONGEST = 250
-MOST_WORDS = 25_500
+MOST_WORDS = 25_000
 SLOW = ("budget=", "threads=", "instruction.", "imitate.", "self_examine.", "evaluate.")
 NOT_EXECUTED = "<!-- not executed -->\n"
 

@@ -229,7 +229,8 @@ class ChangeNetwork(nn.Module):
         """Weigh the score of each kind by how much the change is of that kind.
 
         Args:
-            before, after: states, uint8 [*B, C, H, W].
+            before: states, uint8 [*B, C, H, W].
+            after: those that follow, likewise.
             ended: whether the episode ends there by a stop, bool [*B, 1].
             instruction: token ids, int64 [*B, L].
         """
