@@ -71,7 +71,7 @@ def test_a_gpu_reads_sentences_at_once_and_to_the_same_end(pooling):
 
 def test_ids_outside_the_vocabulary_are_refused(encoder):
     for bad in (-1, 40):
-        with pytest.raises(UserError, match=r"knows 0 to 39"):
+        with pytest.raises(UserError, match=r"hold token .*: allowed are 0..39"):
             encoder(torch.tensor([[1, bad, 2]]))
 
 

@@ -65,7 +65,7 @@ def test_grids_of_other_sizes(size):
         ({"objects": (-1, 4)}, "objects must be"),
         ({"boxes": (2, 8)}, r"within 0\.\.7"),
         ({"size": 3, "objects": (4, 8), "boxes": (2, 4)}, "do not fit"),
-        ({"inside": 1.5}, "probability"),
+        ({"inside": 1.5}, r"inside must be within 0\.\.1"),
         ({"excluded_kinds": tuple(range(1, 13))}, "no kind"),
     ],
 )
