@@ -147,7 +147,7 @@ def test_the_agent_is_talked_to(opened):
     says(opened, "#status", "no sentence of this task, so that nobody can judge it")
     says(opened, "#boards", "step 0 of")
     opened.locator("#completions button").first.click()
-    says(opened, "#status", "Suits, says the instruction classifier: ")
+    says(opened, "#status", "In truth: (it suits|it is so|something|the place)")
     button(opened, "Play").click()
     says(opened, "#boards", "in truth: (not )?fulfilled")
 
@@ -270,6 +270,7 @@ def test_a_step_is_seen_at_once(opened):
     assert min(times) < 0.15  # on an idle machine every one is
 
 
+@pytest.mark.slow
 def test_the_hosted_form_starts(opened, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

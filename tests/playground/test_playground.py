@@ -7,11 +7,11 @@ import torch
 
 from ifo_grounding.data import Demonstrations, record_demonstrations
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import from_pretrained
+from ifo_grounding.networks import from_pretrained, make_policy
 from ifo_grounding.playground import Agent, Lesson, Source, Training, Visit, look
 from ifo_grounding.tasks import grammar
 from ifo_grounding.world import WorldState, kind
-from ifo_grounding.worlds import Grid, OpenGrid
+from ifo_grounding.worlds import BabyAI, Grid, OpenGrid
 from importing import recipes_importable
 
 MOVE = "ifo-grounding/move"
@@ -117,6 +117,22 @@ def test_visits_are_apart_and_say_what_is_wrong(agent, tmp_path):
         first.open(str(tmp_path))
     with pytest.raises(UserError, match="nothing trained yet"):
         first.show()
+
+
+def test_worlds_of_gymnasium_are_played_and_taught_in():
+    world = BabyAI("GoToObj", processes=1)
+    demos, _ = world.demonstrate(2, seed=0)
+    world.vocabulary = demos.vocabulary
+    policies = {"imitation": make_policy(world.simulator(1, seed=0), seed=0)}
+    agent = Agent(world, policies, demos.pool())
+    visit = Visit(Source(lambda name: agent, ("rooms",)))
+    assert visit.played["imitation"].success in (True, False) and not agent.arranges
+    visit.tell(demos.sentences()[0])  # it sets its own missions, and judges no other
+    assert visit.said == demos.sentences()[0] and visit.played["imitation"].success is None
+    assert visit.suited(visit.said) == (None, None) and "<polyline" not in visit.boards()
+    visit.lesson.act(world.actions.index("left"), "turn round")
+    assert visit.lesson.act(world.stop_action, "turn round")
+    assert [len(one.frames) for one in visit.lesson.episodes] == [3]
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -42,8 +42,7 @@ REASONS = {
 """What the oracle's verdicts mean, in words."""
 
 
-@dataclass(frozen=True)
-class Suited:
+class Suited(NamedTuple):
     """Whether a sentence suits a scene."""
 
     probability: float | None

@@ -40,10 +40,13 @@ STYLE = """
 """
 EVENTS = """
 element.tabIndex = 0;
-element.addEventListener('click', event => {
+const tell = event => {
   const on = event.target.closest('[data-cell],[data-act],[data-row]');
   if (on) trigger('click', {...on.dataset});
-});
+};
+// A click would be lost where the picture is drawn anew between press and release.
+element.addEventListener('pointerup', tell);
+element.addEventListener('click', event => { if (event.detail === 0) tell(event); });
 element.addEventListener('keydown', event => {
   const on = element.querySelector(`[data-key="${event.key}"]`);
   if (on) { event.preventDefault(); trigger('click', {...on.dataset}); }

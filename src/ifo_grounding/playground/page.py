@@ -37,6 +37,9 @@ def open_page(source: Source, host: str = LOCAL, port: int = 7860, browser: bool
         except OSError as error:
             reason = error.strerror or error
             raise UserError(f"host={host} port={port}: {reason}; give another port=") from None
+    how = {"theme": theme(), "css": drawing.STYLE, "footer_links": ["settings"], "ssr_mode": False}
+    on = {"server_name": host, "server_port": port, "inbrowser": browser}
+    page.launch(quiet=True, prevent_thread_lock=True, **on, **how)
     print(f"http://{host}:{port} until you press Ctrl-C", flush=True)
     if host != LOCAL:
         print(
@@ -44,10 +47,7 @@ def open_page(source: Source, host: str = LOCAL, port: int = 7860, browser: bool
             "fill its home folder; host=127.0.0.1 keeps it to yourself",
             flush=True,
         )
-    look = {"theme": theme(), "css": drawing.STYLE, "footer_links": ["settings"]}
-    page.launch(
-        server_name=host, server_port=port, inbrowser=browser, quiet=True, ssr_mode=False, **look
-    )
+    page.block_thread()
 
 
 def theme() -> Any:

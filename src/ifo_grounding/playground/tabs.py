@@ -14,6 +14,11 @@ from ifo_grounding.playground.visit import LOOK, TOOLS, Source, Visit
 from ifo_grounding.texts import one_line
 
 gradio: Any = optional("gradio", extra="play")
+IN_TURN: Any = {
+    **{"show_progress": "hidden", "trigger_mode": "multiple"},
+    **{"concurrency_id": "visit", "concurrency_limit": 1},
+}
+"""How events are handled: one after another, so that what was asked for last is drawn last."""
 EVERY = 2.0
 """Seconds between two looks at a training."""
 
@@ -22,12 +27,13 @@ def does(action: Callable[..., Any], draw: Callable[[Visit], Any]) -> Callable[.
     """Return a handler that does something in a visit and draws it; what is wrong is said there."""
 
     def handle(visit: Visit, *values: Any) -> Any:
-        visit.wrong = ""
-        try:
-            action(visit, *values)
-        except (UserError, OSError) as error:
-            visit.wrong = one_line(error)
-        return draw(visit)
+        with visit.turn:
+            visit.wrong = ""
+            try:
+                action(visit, *values)
+            except (UserError, OSError) as error:
+                visit.wrong = one_line(error)
+            return draw(visit)
 
     return handle
 
@@ -46,7 +52,7 @@ class Tab:
 
 def watch_tab(source: Source, visit: Any) -> Tab:
     """Watch and talk."""
-    quiet: Any = {"show_progress": "hidden", "trigger_mode": "multiple"}
+    quiet = IN_TURN
     with gradio.Row():
         name = gradio.Dropdown(list(source.names), label="Networks")
         scene = gradio.Number(0, label="Scene", precision=0, minimum=0)
@@ -114,8 +120,7 @@ def watch_tab(source: Source, visit: Any) -> Tab:
         heard,
         [visit, sentence],
         [completions, status],
-        show_progress="hidden",
-        trigger_mode="always_last",
+        **{**IN_TURN, "trigger_mode": "always_last"},
     )
     completions.click(lambda row: row[0], completions, sentence, **quiet).then(
         does(Visit.tell, draw), [visit, sentence], shown, **quiet
@@ -176,7 +181,7 @@ def _suits(visit: Visit, sentence: str) -> str:
 
 def teach_tab(visit: Any) -> Tab:
     """Teach by showing."""
-    quiet: Any = {"show_progress": "hidden", "trigger_mode": "multiple"}
+    quiet = IN_TURN
     gradio.Markdown(
         "Say what you will show, then show it with the buttons or the keys, and stop. What is kept "
         "are the pictures and your sentence, never what you pressed. Invent a task that nobody "
@@ -270,7 +275,7 @@ def teach_tab(visit: Any) -> Tab:
 
 def look_tab(visit: Any) -> None:
     """Look at recordings."""
-    quiet: Any = {"show_progress": "hidden", "trigger_mode": "multiple"}
+    quiet = IN_TURN
     folder = gradio.Textbox(
         label="Folder of demonstrations: saved ones, pictures, or LeRobot's",
         submit_btn="Look",

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -80,6 +82,8 @@ class Visit:
     """The same, those first that look wrong."""
     row: int | None = None
     """Place in ``rows`` of the one that is seen."""
+    turn: Any = field(default_factory=threading.RLock)
+    """Held while something is done: what a person asks for at once is done one after another."""
 
     def __post_init__(self) -> None:
         self.choose(self.source.names[0])
