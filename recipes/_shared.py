@@ -20,7 +20,7 @@ from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import read_json, write_json, write_record
 from ifo_grounding.machine import choose_threads, machine_of
 from ifo_grounding.options import plain
@@ -125,6 +125,7 @@ def open_stage(options: Options, name: str) -> Stage:
 def world_of(options: Options) -> World:
     """Return the world, with the words of the run's demonstrations where it has none of its own."""
     spec = dict(options.world)
+    judged = spec.pop("judged", None)
     try:
         world: World = instantiate(spec, _convert_="all")
     except Exception as error:  # of an own class, whatever it raises
@@ -137,6 +138,9 @@ def world_of(options: Options) -> World:
         ) from None
     if not isinstance(world, World):
         raise UserError(f"world._target_={spec['_target_']} is no ifo_grounding.worlds.World")
+    if judged is not None:
+        check_choice("world.judged", judged, (True, False))
+        world.judged = judged
     recorded = Run(options.run) / DEMONSTRATIONS
     if world.vocabulary is None and recorded.exists():
         world.vocabulary = Demonstrations.load(recorded).vocabulary

@@ -5,7 +5,7 @@ python recipes/play.py to=play.gif scene=7 sentence="move to the red diamond"
 """
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from ifo_grounding.files import atomic_write
 from ifo_grounding.networks import from_pretrained
 from ifo_grounding.networks.hub import OWN
 from ifo_grounding.options import options_of
-from ifo_grounding.playground import Agent, Source
+from ifo_grounding.playground import Agent, Source, taught_in
 from ifo_grounding.tasks import TASKS, grammar
 from ifo_grounding.texts import one_line
 from ifo_grounding.training import Run
@@ -118,17 +118,17 @@ def load(name: str) -> Agent:
 
     phases = dict(zip(("imitation", "self-examination"), POLICIES.values(), strict=True))
     others = there(instruction=CLASSIFIER, goal=GOAL, value=VALUE, inverse=INVERSE)
-    world = world_of(made)
-    return Agent(world, there(**phases), load_demonstrations(run).pool(), **others)
+    agent = Agent(world_of(made), there(**phases), load_demonstrations(run).pool(), **others)
+    return agent if agent.arranges else replace(agent, teach=taught_in(made.world))
 
 
 @recipe_main
 def main(options: PlayOptions) -> None:
     if options.to is None:
-        from ifo_grounding.playground.page import open_page
+        from ifo_grounding.playground.page import LOCAL, open_page
 
         names = (named(options), *(f"{OWN}/{task}" for task in TASKS))
-        source = Source(load, tuple(dict.fromkeys(names)), local=options.host == "127.0.0.1")
+        source = Source(load, tuple(dict.fromkeys(names)), local=options.host == LOCAL)
         open_page(source, options.host, options.port, options.browser)
         return
     found = play(options)

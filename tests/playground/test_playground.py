@@ -1,6 +1,7 @@
 """What stands behind the page: an agent that is told things, a lesson, a look at recordings."""
 
 import importlib
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,17 @@ import torch
 from ifo_grounding.data import Demonstrations, record_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import from_pretrained, make_policy
-from ifo_grounding.playground import Agent, Lesson, Source, Training, Visit, look
+from ifo_grounding.options import options_of
+from ifo_grounding.playground import (
+    Agent,
+    Lesson,
+    Source,
+    Training,
+    Visit,
+    look,
+    taught_in,
+    teaching,
+)
 from ifo_grounding.tasks import grammar
 from ifo_grounding.world import WorldState, kind
 from ifo_grounding.worlds import BabyAI, Grid, OpenGrid
@@ -133,6 +144,30 @@ def test_worlds_of_gymnasium_are_played_and_taught_in():
     visit.lesson.act(world.actions.index("left"), "turn round")
     assert visit.lesson.act(world.stop_action, "turn round")
     assert [len(one.frames) for one in visit.lesson.episodes] == [3]
+
+
+def test_a_lesson_is_trained_in_the_world_in_which_it_was_shown(agent):
+    rooms = {"_target_": "ifo_grounding.worlds.BabyAI", "level": "GoToObj", "processes": None}
+    options = options_of(*taught_in(rooms))
+    assert options.world == {**rooms, "judged": False} and options.task == "taught"
+    agents = {"own": agent, "rooms": replace(agent, teach=taught_in(rooms))}
+    visit = Visit(Source(agents.get, ("own", "rooms")))
+    visit.choose("rooms")
+    assert visit.study.teach == taught_in(rooms)  # nothing was shown before
+    visit.lesson.act(STOP, "stay")
+    visit.choose("own")
+    assert visit.study.teach == taught_in(rooms) and len(visit.lesson.episodes) == 1
+
+
+def test_a_long_demonstration_can_be_stopped_and_not_go_on(monkeypatch):
+    monkeypatch.setattr(teaching, "MOST_STEPS", 1)
+    lesson = Lesson(OpenGrid(), seed=0)
+    for action in (UP, RIGHT, DOWN, LEFT):
+        if not lesson.steps:
+            lesson.act(action, "go")
+    with pytest.raises(UserError, match="that is 1 steps: stop"):
+        lesson.act(UP, "go")
+    assert lesson.act(STOP, "go")
 
 
 @pytest.mark.slow

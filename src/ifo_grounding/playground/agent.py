@@ -42,6 +42,23 @@ REASONS = {
 """What the oracle's verdicts mean, in words."""
 
 
+def taught_in(world: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return options of a command that trains from a person's demonstrations in a world.
+
+    Args:
+        world: its options, with its class as ``_target_``.
+
+    >>> taught_in({"_target_": "own.Dial", "marks": None})[1:4]
+    ('world._target_=own.Dial', '+world.marks=null', '+world.judged=False')
+    """
+    world = {**world, "judged": False}  # nobody else knows what the person means
+    given = [
+        f"{'' if name == '_target_' else '+'}world.{name}={'null' if value is None else value}"
+        for name, value in world.items()
+    ]
+    return ("world=own", *given, "task=taught", "budget=demo")
+
+
 class Suited(NamedTuple):
     """Whether a sentence suits a scene."""
 
@@ -85,15 +102,8 @@ class Agent:
     """Its value network."""
     inverse: Any = None
     """Its inverse model."""
-    teach: Sequence[str] = (
-        *(
-            "world=own",
-            "world._target_=ifo_grounding.worlds.OpenGrid",
-            "task=taught",
-            "budget=demo",
-        ),
-    )
-    """Options of a command that trains from a person's demonstrations in this world."""
+    teach: Sequence[str] = taught_in({"_target_": "ifo_grounding.worlds.OpenGrid"})
+    """Options of a command that trains from a person's demonstrations in ``taught``."""
 
     @property
     def vocabulary(self) -> Vocabulary:

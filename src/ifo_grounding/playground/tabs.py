@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 from ifo_grounding.errors import UserError, optional
 from ifo_grounding.playground import drawing
@@ -43,11 +43,13 @@ def wrong(visit: Visit) -> str:
     return f'<p class="wrong" role="alert">{escape(visit.wrong)}</p>' if visit.wrong else ""
 
 
-class Tab:
+class Tab(NamedTuple):
     """One tab: its outputs, and what draws them."""
 
-    def __init__(self, draw: Callable[[Visit], Any], shown: list[Any], show: Any = None) -> None:
-        self.draw, self.shown, self.show = draw, shown, show
+    draw: Callable[..., Any]
+    shown: list[Any]
+    show: Any = None
+    """The button that shows what was trained."""
 
 
 def watch_tab(source: Source, visit: Any) -> Tab:
@@ -252,22 +254,21 @@ def teach_tab(visit: Any) -> Tab:
             raise UserError("choose a demonstration first: click on its row")
         visit.lesson.drop(row)
 
-    def saved(visit: Visit, form: str) -> list[Any]:
-        visit.wrong = ""
-        try:
-            folder, file = visit.archive(form)
-            return [str(file), f"<p>Written: {escape(str(folder))}</p>"]
-        except (UserError, OSError) as error:
-            visit.wrong = one_line(error)
+    def saved(visit: Visit) -> list[Any]:
+        if visit.wrong or visit.saved is None:
             return [None, wrong(visit)]
+        folder, file = visit.saved
+        return [str(file), f"<p>Written: {escape(str(folder))}</p>"]
+
+    def finished(visit: Visit, said: str) -> None:
+        visit.lesson.finish(said)
 
     board.click(pressed, [visit, sentence], shown, **quiet)
     listed.click(looked, visit, shown, **quiet)
     drop.click(does(dropped, draw), [visit, chosen], shown, **quiet)
     again.click(does(lambda visit: visit.lesson.begin(), draw), visit, shown, **quiet)
-    finish: Callable[..., Any] = lambda visit, said: visit.lesson.finish(said)  # noqa: E731
-    done.click(does(finish, draw), [visit, sentence], shown, **quiet)
-    save.click(saved, [visit, form], [file, status], **quiet)
+    done.click(does(finished, draw), [visit, sentence], shown, **quiet)
+    save.click(does(Visit.archive, saved), [visit, form], [file, status], **quiet)
     train.click(does(Visit.train, draw), visit, shown, **quiet)
     timer.tick(trained, visit, [progress, timer], **quiet)
     return Tab(draw, shown, show)

@@ -101,9 +101,9 @@ class Lesson:
         said = words_of(sentence)
         if not 1 <= len(said) <= WORDS:
             raise UserError(f"say first what you show, in 1 to {WORDS} words, and then show it")
-        if self.steps >= MOST_STEPS:
-            raise UserError(f"that is {MOST_STEPS} steps: stop, or begin anew")
         stops = action == self.world.stop_action
+        if self.steps >= MOST_STEPS and not stops:
+            raise UserError(f"that is {MOST_STEPS} steps: stop, or begin anew")
         stepped = self._env.step(self._state.set(keys.ACTION, torch.tensor([action])))
         self._state = self._env.step_mdp(stepped)
         frame = stepped[keys.NEXT, keys.PIXELS][0].cpu().numpy().copy()

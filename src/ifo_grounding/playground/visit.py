@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,8 @@ class Study:
     """What a person shows and trains; it outlives the tab."""
 
     lesson: Lesson | None = None
+    teach: Sequence[str] = ()
+    """Options of the command that trains in the lesson's world."""
     training: Training | None = None
 
 
@@ -82,6 +84,8 @@ class Visit:
     """The same, those first that look wrong."""
     row: int | None = None
     """Place in ``rows`` of the one that is seen."""
+    saved: tuple[Path, Path] | None = None
+    """Folder and file of what was saved last."""
     turn: Any = field(default_factory=threading.RLock)
     """Held while something is done: what a person asks for at once is done one after another."""
 
@@ -101,9 +105,9 @@ class Visit:
         """Take the networks of a name, and go to its first scene."""
         check_choice("networks", name, self.names)
         agent = self.source.load(name)
-        lesson = self.study.lesson
-        if lesson is None or (not lesson.episodes and type(lesson.world) is not type(agent.taught)):
-            self.study.lesson = Lesson(agent.taught)
+        study, lesson = self.study, self.study.lesson
+        if lesson is None or (not lesson.episodes and study.teach != agent.teach):
+            study.lesson, study.teach = Lesson(agent.taught), agent.teach
         self.name, self.agent = name, agent
         self.go(0, 0)
 
@@ -189,17 +193,17 @@ class Visit:
         assert self.study.lesson is not None
         return self.study.lesson
 
-    def archive(self, form: str) -> tuple[Path, Path]:
-        """Write what was shown; return its folder, and all of it in one file."""
+    def archive(self, form: str) -> None:
+        """Write what was shown into a folder, and all of it into one file."""
         folder = self.lesson.save(form)
         file = Path(tempfile.mkdtemp()) / folder.name
-        return folder, Path(shutil.make_archive(str(file), "zip", folder))
+        self.saved = folder, Path(shutil.make_archive(str(file), "zip", folder))
 
     def train(self) -> None:
         """Train both phases from what was shown, in the background."""
         if self.study.training is not None and not self.study.training.ended:
             raise UserError("a training is under way: wait for its end")
-        self.study.training = Training(self.lesson, self.agent.teach)
+        self.study.training = Training(self.lesson, self.study.teach)
 
     def show(self) -> None:
         """Watch what was trained."""
