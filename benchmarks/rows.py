@@ -322,13 +322,12 @@ def imitation(preset: str) -> Row:
     policy = networks.make_policy(demos, preset, seed=0, device=DEVICE)
     config = FitConfig(steps=steps, batch_size=size, iteration=steps, schedule="constant")
 
-    def work(policy: torch.nn.Module = policy) -> float:
+    def work() -> float:
         fit(ImitationLoss(policy), buffer, config, seed=0, cudagraph=True)
         return size * steps
 
     if preset == "strong":
         return Row("imitation, preset strong", "samples/s", ours(work), {"rate": 16e3})
-    rough = networks.make_policy(demos, preset, seed=0, device=DEVICE, precision="bf16")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.npz"
         batch = buffer.sample(4096).cpu()
@@ -341,7 +340,6 @@ def imitation(preset: str) -> Row:
         "samples/s",
         {
             **ours(work),
-            "ours in bf16": finished(lambda: work(rough)),
             **peer.contender("train"),
             **peer.contender("train ours", "imitation with our layers"),
         },

@@ -163,10 +163,12 @@ def test_the_package_is_the_command_too(module, capsys, monkeypatch):
 
 
 def test_help_ends_where_its_reader_does():
-    script = recipes_folder() / "imitate.py"
-    command = f"{sys.executable} {script} --help | head -1"
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
-    assert (done.stdout.count("\n"), done.stderr) == (1, "")
+    command = [sys.executable, "-m", "ifo_grounding", "--help"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout and process.stderr
+        process.stdout.close()
+        assert (process.stderr.read(), process.wait()) == ("", cli.CLOSED)
 
 
 def test_help_and_version(capsys):

@@ -9,7 +9,8 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import data, networks
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.objectives import GoalLoss, InstructionLoss
+from ifo_grounding.objectives import GoalLoss, ImitationLoss, InstructionLoss
+from ifo_grounding.training.updates import total_loss
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 from pretended_gpu import pretended_gpu
 
@@ -91,8 +92,12 @@ def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
         assert losses("cuda") == pytest.approx(here, abs=1e-4)
 
 
+WAITS = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "unique", "_unique2"}
+"""Operations by which a program waits for a GPU."""
+
+
 class Asking(TorchDispatchMode):
-    """Notes the operations by which a program waits for a GPU."""
+    """Notes the operations that are called."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -114,4 +119,16 @@ def test_a_step_and_a_reset_ask_a_gpu_nothing():
                 simulator.pixels()
                 simulator.reset(terminated | truncated)
     assert "where" in asking.noted and simulator.numbers.max() > 7
-    assert not asking.noted & {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "unique"}
+    assert not asking.noted & WAITS
+
+
+@pytest.mark.parametrize("preset", ["paper", "strong"])
+def test_a_step_of_imitation_asks_a_gpu_nothing(preset):
+    demos, truth = data.record_demonstrations("pick", 20, seed=0, keep_truth=True)
+    batch = data.labelled_buffer(demos, truth.actions)[:]
+    with pretended_gpu():
+        loss = ImitationLoss(networks.make_policy(demos, preset, seed=0, device="cuda"))
+        with Asking() as asking:
+            total_loss(loss(batch.to("cuda"))).backward()
+    assert "mm" in asking.noted or "addmm" in asking.noted
+    assert not asking.noted & WAITS

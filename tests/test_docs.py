@@ -92,16 +92,16 @@ def test_start_ends_with_a_policy_of_the_readers_own_world(tmp_path, monkeypatch
 
 
 def commands(*starts: str) -> list[tuple[str, list[str]]]:
-    """Every shell command of the pages that begins with one of the given words."""
+    """Every shell command of the pages from one of the given words on, also behind `srun`."""
     found = []
     for page in PAGES:
         for _, code in blocks(page, "bash", "sh"):
-            for line in code.replace("\\\n", " ").splitlines():
+            code = code.replace("\\\n", " ").replace("-m ifo_grounding", "ifo-grounding")
+            for line in code.splitlines():
                 words = shlex.split(line, comments=True)
-                while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
-                    words.pop(0)
-                if words and words[0] in starts:
-                    found.append((name_of(page), words))
+                at = [words.index(start) for start in starts if start in words]
+                if at:
+                    found.append((name_of(page), words[min(at) :]))
     return found
 
 
@@ -117,8 +117,10 @@ def test_every_recipe_command_has_options_that_exist(tmp_path, monkeypatch):
             continue
         recipe, words = resolve(command, rest)
         assert recipe in recipe_names(), page
-        # A reader's own folder is not there.
-        given = (w for w in words if "=" in w and not w.startswith("recorded="))
+        # A reader's own folder is not there, nor a GPU.
+        given = [w for w in words if "=" in w and not w.startswith(("recorded=", "device="))]
+        if recipe not in own and not any(w.startswith("budget=") for w in given):
+            given.append("budget=many")  # named, it is composed at once
         asked.add((recipe if recipe in own else "two_phase", *given, *MULTIRUN))
     assert len(asked) >= 5
     seen = set()

@@ -7,7 +7,8 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,25 @@ def run_on_cluster(chains: Sequence[Sequence[Call]], progress: bool = True) -> l
                 else:
                     bar.update()
     return [call for chain in chains for call in [each for each in chain if each in failed][:1]]
+
+
+def spread(function: Callable[[Any], Any], values: Iterable[Any]) -> Iterator[Any]:
+    """Yield what a function returns for each value, in order, as Ray tasks of one processor each.
+
+    Not many more are called than are waited for. A task whose process or machine dies runs again.
+    """
+    ray = connect()
+    task = ray.remote(num_cpus=1, max_retries=RETRIES, runtime_env=environment())(_apply)
+    ahead, waiting = 2 * int(ray.cluster_resources().get("CPU", 1)), deque[Any]()
+    for value in values:
+        waiting.append(task.remote(function, value))
+        if len(waiting) > ahead:
+            yield ray.get(waiting.popleft())
+    yield from map(ray.get, waiting)
+
+
+def _apply(function: Callable[[Any], Any], value: Any) -> Any:
+    return function(value)
 
 
 def _run(call: Call, folder: str, _before: None) -> None:

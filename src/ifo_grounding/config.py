@@ -197,7 +197,9 @@ class SelfExamineConfig(SelfExaminationConfig):
         if self.collectors and self.num_envs % self.collectors:
             raise UserError(f"num_envs={self.num_envs} are no {self.collectors} equal shares")
         if self.collectors and self.pairs:
-            raise UserError("stored pairs are cycled through in one process: set collectors=null")
+            raise UserError(
+                "stored pairs are cycled through in one process: set collectors=null or pairs=null"
+            )
         check_range(self, "imitation_weight", "reward_steps", least=0)
         check_range(self, "reward_lr", above=0)
 

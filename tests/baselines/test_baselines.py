@@ -186,7 +186,7 @@ def test_a_change_is_scored_as_the_kind_that_it_looks_like():
 def test_updates_tell_demonstrations_from_the_policy(name, sources):
     method = {"actions": GAIL, "frames": GAIfO, "steps": AGILE}[name]
     torch.manual_seed(0)
-    adversary = method(sources[name], steps=40, lr=5e-3, batch_size=32, features=16, seed=0)
+    adversary = method(sources[name], steps=20, lr=1e-2, batch_size=32, features=16, seed=0)
     batch = sources["steps"].starts(seed=2).rollout(12, break_when_any_done=False)
     metrics = adversary(batch)
     assert not adversary.network.training

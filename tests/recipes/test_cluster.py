@@ -11,8 +11,10 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
+from comparing import assert_same
 from ifo_grounding.cli import main
 from ifo_grounding.cluster import Call, run_on_cluster
+from ifo_grounding.data import record_babyai
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.keys import ACTION, LEARNED_REWARD, NEXT, PIXELS
@@ -125,6 +127,13 @@ def test_practice_ends_with_one_line_where_a_node_is_missing_and_goes_on_when_it
     assert torch.equal(before[ACTION], after[ACTION])
 
 
+def test_babyais_bot_is_recorded_by_all_processors(cluster):
+    pytest.importorskip("minigrid")
+    one, all_of_them = (record_babyai("GoToLocal", 8, seed=1, processes=n) for n in (1, 2))
+    assert_same(one, all_of_them)
+    assert ray.is_initialized()
+
+
 @pytest.fixture
 def one_machine(monkeypatch):
     """Ray on this machine alone, with two processors."""
@@ -169,18 +178,32 @@ def test_workers_act_by_the_newest_weights_also_of_the_networks_in_transforms(on
 
 
 @pytest.mark.timeout(1800)
-def test_a_recipe_collects_on_ray(one_machine, options, phase_1):
+def test_a_recipe_collects_the_same_where_a_worker_has_died(one_machine, options, phase_1):
     from self_examine import examine
     from train_goal import train_goal
     from train_instruction import train_instruction
 
-    given = ("self_examine.collectors=2", "self_examine.iterations=2", f"base={phase_1}")
-    chosen = options(*given, run="on-ray")
-    train_instruction(chosen)
-    train_goal(chosen)
-    assert examine(chosen)["frames"] == 8 * 10
-    rows = read_json(phase_1.parent / "on-ray/metrics/self_examine.json")
-    assert len(rows) == 2 and rows[-1]["states_served"] >= 8 and "selection_return" in rows[-1]
+    def examined(run):
+        given = ("self_examine.collectors=2", "self_examine.iterations=2", f"base={phase_1}")
+        chosen = options(*given, run=run)
+        train_instruction(chosen)
+        train_goal(chosen)
+        assert examine(chosen)["frames"] == 8 * 10
+        return read_json(phase_1.parent / run / "metrics/self_examine.json")
+
+    def kill():
+        killed.append(soon(lambda: processes("Worker")[1:])[0])
+        os.kill(killed[0], signal.SIGKILL)
+
+    killed = []
+    undisturbed = examined("undisturbed")
+    assert len(undisturbed) == 2 and undisturbed[-1]["states_served"] >= 8
+    soon(lambda: not processes("Worker"))
+    killer = threading.Thread(target=kill)
+    killer.start()
+    assert examined("disturbed") == undisturbed
+    killer.join()
+    assert killed
 
 
 @pytest.mark.timeout(1800)

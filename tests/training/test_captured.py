@@ -36,7 +36,9 @@ def test_an_optimizer_is_captured_or_not_whatever_a_checkpoint_says():
 def test_only_steps_that_are_all_the_same_can_be_captured():
     demos = record_demonstrations("move", 2, seed=0)
     assert ImitationLoss(make_policy(demos, "paper", seed=0)).capturable
-    assert not ImitationLoss(make_policy(demos, "strong", seed=0)).capturable  # penalises words
+    strong = make_policy(demos, "strong", seed=0)
+    assert ImitationLoss(strong).capturable
+    assert not ImitationLoss(strong, words_from=0.5).capturable  # penalises words later on
     suitable = make_instruction_classifier(demos, "paper", seed=0)
     assert InstructionLoss(suitable, demos.pool(), removal_rate=0.0).capturable
     assert not InstructionLoss(suitable, demos.pool(), removal_rate=0.3).capturable  # counts some

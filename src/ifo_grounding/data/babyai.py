@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import os
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ifo_grounding.cluster import spread
 from ifo_grounding.data._episodes import Episode
 from ifo_grounding.data.codec import TILE_SIZES
 from ifo_grounding.data.demonstrations import Demonstrations
@@ -148,7 +150,8 @@ def record_babyai(  # type: ignore[misc]  # the overloads leave options open
         level: of BabyAI, see :func:`babyai`.
         keep_truth: whether to return the bot's actions too, for evaluation only.
         processes: how many record side by side; with several, a script needs its
-            ``if __name__ == "__main__":``.
+            ``if __name__ == "__main__":``, and where ``RAY_ADDRESS`` names a Ray cluster, all its
+            processors record.
         vocabulary: the words of the missions; by default those that occur.
 
     Raises:
@@ -201,6 +204,9 @@ def _played(make: Make, seeds: Iterator[int], processes: int) -> Iterator[Played
     play = functools.partial(_play, make)
     if processes == 1:
         yield from map(play, seeds)
+        return
+    if os.environ.get("RAY_ADDRESS"):
+        yield from spread(play, seeds)
         return
     # Fresh processes: forked ones would inherit torch's threads.
     with ProcessPoolExecutor(processes, get_context("spawn"), _heed_the_parent) as pool:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import scipy
 import torch
-from scipy import stats as scipy_stats
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -165,7 +165,7 @@ def _servable(state: WorldState, goals: Goal, goal_numbers: Tensor, max_steps: i
 def _entropy_bits(values: Tensor) -> float:
     """Return the entropy of the distribution of values, in bits."""
     counts = values.unique(return_counts=True)[1]
-    return float(scipy_stats.entropy(counts, base=2)) if len(counts) else 0.0
+    return float(scipy.stats.entropy(counts, base=2)) if len(counts) else 0.0
 
 
 def _threshold_quality(pairs: list[tuple[Tensor, Tensor]], threshold: float) -> dict[str, Any]:

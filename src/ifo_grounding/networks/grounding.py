@@ -81,16 +81,23 @@ class WordMaps(nn.Module):
 
     def forward(self, seen: Appearance, tokens: Tensor) -> tuple[Tensor, Tensor]:
         """Return the maps' logits [N, maps, h * w] and the modifier [N, MODIFIER]."""
-        counts = (self.usual != 0).any(1)
-        counts[tokens] = True  # of the others no evidence is needed
-        used = counts.nonzero().squeeze(1)
+        used = None
+        if not tokens.is_cuda:  # which would have to be waited for
+            counts = (self.usual != 0).any(1)
+            counts[tokens] = True  # of the others no evidence is needed
+            used = counts.nonzero().squeeze(1)
         colour, form = self.evidence(seen, used)
         spoken, modifier = self.listen(tokens, used)
         if self.training:
             said = torch.zeros(len(self.usual), dtype=torch.bool, device=tokens.device)
             said[tokens] = True
             said[0] = False
-            self.word_penalty = _spread(colour[:, said[used]]) + _spread(form[:, said[used]])
+            if used is None:
+                spreads = _spread(colour) + _spread(form)
+                self.word_penalty = torch.where(said, spreads, 0).sum()
+            else:
+                colours, forms = colour[:, said[used]], form[:, said[used]]
+                self.word_penalty = _spread(colours).sum() + _spread(forms).sum()
         evidence = look_up(colour + form, seen.where)
         return spoken.transpose(1, 2) @ evidence.transpose(1, 2), modifier
 
@@ -143,12 +150,13 @@ def swap_words(tokens: Tensor, share: float) -> Tensor:
     """
     lengths = (tokens != 0).sum(1)
     order = (lengths + torch.rand(lengths.shape, device=tokens.device)).argsort()
-    other = torch.empty_like(order)
-    other[order] = order.roll(1)
     # The first of each length has a longer or shorter one before it: the last of its own is its.
+    place = torch.arange(len(order), device=tokens.device)
     first = lengths[order] != lengths[order.roll(1)]
-    last = lengths[order] != lengths[order.roll(-1)]
-    other[order[first]] = order[last]
+    group = first.cumsum(0)
+    last = place.new_zeros(len(order) + 1).scatter_reduce(0, group, place, "amax")
+    before = torch.where(first, last[group], place - 1)
+    other = torch.empty_like(order).scatter(0, order, order[before])
     swapped = torch.rand(tokens.shape, device=tokens.device) < share
     return torch.where(swapped, tokens[other], tokens)
 
@@ -237,5 +245,5 @@ def surroundings(layers: nn.Module, shown: Tensor, grid: tuple[int, int]) -> Ten
 
 
 def _spread(evidence: Tensor) -> Tensor:
-    """Return the sum over words of the standard deviation over cells, of [U, V]."""
-    return evidence.var(0, unbiased=False).add(1e-4).sqrt().sum()
+    """Return the standard deviation over cells of [U, V], for each word [V]."""
+    return evidence.var(0, unbiased=False).add(1e-4).sqrt()

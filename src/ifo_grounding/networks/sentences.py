@@ -190,8 +190,11 @@ def rows_of_ids(tokens: Tensor) -> Tensor:
 
 
 def without_padding(tokens: Tensor, words: int) -> Tensor:
-    """Cut [N, L] behind the end of the longest instruction, or refuse ids of no word."""
-    if not tokens.numel():
+    """Cut [N, L] behind the end of the longest instruction, or refuse ids of no word.
+
+    Not on a GPU, which would have to be waited for: there CUDA raises.
+    """
+    if not tokens.numel() or tokens.is_cuda:
         return tokens
     check_below("instructions for this network hold token", tokens, words)
     return tokens[:, : max(int(sentence_lengths(tokens).max()), 1)]

@@ -67,6 +67,11 @@ class ImitationLoss(SupervisedLoss):
         self.word_penalty, self.words_from = word_penalty, share("words_from", words_from)
         self.set_progress(0.0)
 
+    @property
+    def capturable(self) -> bool:
+        """Whether all training steps do the same: not where words are held to it later on."""
+        return super().capturable or not self.words_from
+
     def set_progress(self, fraction: float) -> None:
         """Say which share of training is done."""
         self.holds_words = fraction >= self.words_from

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from statistics import NormalDist
 
 import numpy as np
+import scipy  # whose parts are loaded where they are used: `scipy.stats` alone takes a second
 from numpy.typing import ArrayLike
-from scipy import optimize
-from scipy import stats as scipy_stats
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.stats.results import CONFIDENCE, Estimate
 
-Z = float(scipy_stats.norm.ppf(0.5 + CONFIDENCE / 2))
+Z = NormalDist().inv_cdf(0.5 + CONFIDENCE / 2)
 """Standard errors on either side of an estimate that a normal interval covers."""
 
 
@@ -46,7 +46,7 @@ def auc(scores: ArrayLike, positive: ArrayLike, groups: ArrayLike | None = None)
     if of.all() or not of.any():
         return Estimate(math.nan, 0.0, 1.0, len(every), "area under the ROC curve")
     positives, negatives = int(of.sum()), int((~of).sum())
-    wins = scipy_stats.rankdata(every)[of].sum() - positives * (positives + 1) / 2
+    wins = scipy.stats.rankdata(every)[of].sum() - positives * (positives + 1) / 2
     value = float(wins / (positives * negatives))
     sizes = len(np.unique(group[of])), len(np.unique(group[~of]))
     low, high = _limit(value, 0.0, *sizes), _limit(value, 1.0, *sizes)
@@ -68,4 +68,4 @@ def _limit(value: float, end: float, m: int, n: int) -> float:
     if value == end:
         return end
     beside = value + (end - value) * 1e-9  # at 0 and 1 there is no error, and another root
-    return float(optimize.brentq(excess, beside, end))
+    return float(scipy.optimize.brentq(excess, beside, end))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import beta, binomtest, t
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.stats.results import CONFIDENCE, Difference, Rate
@@ -30,7 +30,7 @@ def wilson(successes: int, count: int) -> Rate:
     successes, count = int(successes), int(count)
     if count == 0:
         return Rate(math.nan, 0.0, 1.0, 0, 0, "wilson")
-    low, high = binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
+    low, high = scipy.stats.binomtest(successes, count).proportion_ci(CONFIDENCE, method="wilson")
     return Rate(successes / count, float(low), float(high), successes, count, "wilson")
 
 
@@ -142,7 +142,8 @@ def paired_difference(before: ArrayLike, after: ArrayLike) -> Difference:
     better, worse = int((change > 0).sum()), int((change < 0).sum())
     bounds = [*_bootstrap_bounds(change), *_exact_bounds(better, worse, *change.shape)]
     if seeds == 1:
-        p_value = float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
+        changed = better + worse
+        p_value = float(scipy.stats.binomtest(better, changed).pvalue) if changed else 1.0
         method = "bootstrap over scenes, exact McNemar test"
     else:
         p_value = _t_test(change)
@@ -180,7 +181,7 @@ def _exact_bounds(better: int, worse: int, seeds: int, scenes: int) -> list[floa
 
 def _exact_upper(count: float, of: int) -> float:
     """Return Clopper and Pearson's upper bound of a share; the count, a mean, may be no whole."""
-    return 1.0 if count >= of else float(beta.ppf(1 - TAIL, count + 1, of - count))
+    return 1.0 if count >= of else float(scipy.stats.beta.ppf(1 - TAIL, count + 1, of - count))
 
 
 def _t_test(change: NDArray[np.float64]) -> float:
@@ -197,8 +198,8 @@ def _t_test(change: NDArray[np.float64]) -> float:
             error = max(error, rest)
     error = math.sqrt(error)
     if not error:  # every scene fares alike with every seed
-        return float(binomtest(scenes, scenes).pvalue) if change.mean() else 1.0
-    return float(2 * t.sf(abs(change.mean()) / error, seeds - 1))
+        return float(scipy.stats.binomtest(scenes, scenes).pvalue) if change.mean() else 1.0
+    return float(2 * scipy.stats.t.sf(abs(change.mean()) / error, seeds - 1))
 
 
 def holm(p_values: ArrayLike) -> list[float]:

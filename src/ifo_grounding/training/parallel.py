@@ -77,11 +77,11 @@ def copy_run(folder: Path, to: Path) -> None:
 def averaging(loss: nn.Module) -> Callable[[TensorDictBase], Any]:
     """Return a loss whose gradients are the mean over all processes: itself where it learns alone.
 
-    A network may leave some of its weights unused in a step.
+    A network may leave some of its weights unused, the same ones in every step.
     """
     if processes() == 1:
         return loss
-    return DistributedDataParallel(_Losses(loss), find_unused_parameters=True)
+    return DistributedDataParallel(_Losses(loss), static_graph=True)
 
 
 class _Losses(nn.Module):

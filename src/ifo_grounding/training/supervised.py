@@ -123,8 +123,8 @@ def fit(
         until: steps after which to pause, rounded up to whole iterations; a later call with the
             same checkpoint goes on. None learns to the end.
         cudagraph: whether to capture the step as a CUDA graph on a GPU, where the loss is
-            ``capturable``, weights do not decay and samples are drawn at random; for networks that
-            compute the same whatever they see, as those of this library do.
+            ``capturable`` and samples are drawn at random; for networks that compute the same
+            whatever they see, as those of this library do.
 
     Returns mean metrics of each iteration, with ``step`` and ``samples_per_second``.
 
@@ -155,8 +155,7 @@ def fit(
     saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
     loop = Loop(name, pause_at, saved, checkpoint_seconds, log, progress)
     same_steps = getattr(loss, "capturable", False) and isinstance(sampler, RandomSampler)
-    captured = cudagraph and device.type == "cuda" and same_steps and not decay
-    captured = captured and processes() == 1
+    captured = cudagraph and device.type == "cuda" and same_steps and processes() == 1
     let_capture(optimizer, captured)
     shared = averaging(loss)
 

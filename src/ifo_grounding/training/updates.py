@@ -32,8 +32,12 @@ def decay_towards_origin(optimizer: torch.optim.Optimizer, module: nn.Module) ->
     @torch.no_grad()
     def undo(optimizer: torch.optim.Optimizer, *_: Any) -> None:
         group = optimizer.param_groups[0]
+        share = group["lr"] * group["weight_decay"]
         for weight, start in begun:
-            weight.add_(start, alpha=group["lr"] * group["weight_decay"])
+            if isinstance(share, Tensor):  # a graph reads it
+                weight.addcmul_(start, share)
+            else:
+                weight.add_(start, alpha=share)
 
     optimizer.register_step_post_hook(undo)
 

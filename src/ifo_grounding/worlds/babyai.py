@@ -25,7 +25,8 @@ class BabyAI(World):
     tile_size: int = 8
     """Pixels along one side of a cell."""
     processes: int | None = None
-    """Processes that record the bot side by side; null: all cores that this one may use."""
+    """Processes that record the bot side by side; null: all cores that this one may use, or of the
+    Ray cluster that ``RAY_ADDRESS`` names."""
 
     def __post_init__(self) -> None:
         babyai(self.level, self.tile_size)  # refuses what is no level
