@@ -30,9 +30,16 @@ def runs_of(folder: str, order: Sequence[str]) -> dict[tuple[str, int], Runs]:
     return dict(sorted(plain.items(), key=lambda item: (order.index(item[0][0]), item[0][1])))
 
 
+def studied() -> dict[tuple[str, int], Runs]:
+    """Return the runs of each task and number of demonstrations: the newest with five seeds."""
+    newest = {key: runs for key, runs in runs_of("few", TASKS).items() if len(runs) >= 5}
+    found = runs_of("study", TASKS) | newest
+    return dict(sorted(found.items(), key=lambda item: (TASKS.index(item[0][0]), item[0][1])))
+
+
 def study_rows() -> dict[tuple[str, int], Row]:
     """Return a row for each study; p is corrected for the tasks with as many demonstrations."""
-    found = runs_of("study", TASKS)
+    found = studied()
     p: dict[tuple[str, int], float] = {}
     for number in {number for _, number in found}:
         same = [key for key in found if key[1] == number]
@@ -75,7 +82,7 @@ def few_rows(found: dict[tuple[str, int], Runs]) -> list[Row]:
 def choice_rows(number: int) -> list[Row]:
     """Return what the instruction classifier chose with some number of demonstrations."""
     names = {"suitable": "rate", "states served": "served", "states that can be": "servable"}
-    found = {task: runs for (task, n), runs in runs_of("study", TASKS).items() if n == number}
+    found = {task: runs for (task, n), runs in studied().items() if n == number}
     return [{"task": t, **{n: chosen(r, names[n]) for n in names}} for t, r in found.items()]
 
 
@@ -93,7 +100,7 @@ def efficiency_picture() -> bytes:
     """Draw what `strong` reaches on each task by number of demonstrations, and the paper's best."""
     most = {(task, 80_000): pieces()[task, "strong", "pairs-5000"] for task in TASKS}
     best = {task: {"paper, 80,000": max(TABLE_2[task]) / 100} for task in TASKS}
-    panels = curves(runs_of("study", TASKS) | most, PHASES)
+    panels = curves(studied() | most, PHASES)
     return figure_png(rates_by_number(panels, references=best))
 
 
@@ -197,13 +204,11 @@ def minutes(runs: Runs) -> int:
 
 def tables() -> dict[str, str]:
     """Return every table by name."""
-    studied, demo = study_rows(), runs_of("few", TASKS)
-    two_hundred = {key: runs for key, runs in runs_of("study", TASKS).items() if key[1] == 200}
+    rows, shown = study_rows(), {("move", 50), *((task, 200) for task in TASKS)}
     found: dict[str, list[Row]] = {
-        "demo": few_rows(demo),
-        "few": few_rows(demo | two_hundred),
-        "results": [row for (_, number), row in studied.items() if number == 200],
-        "up-to-2000": [row for (_, n), row in studied.items() if n <= 2000 and n != 200],
+        "few": few_rows({key: runs for key, runs in studied().items() if key in shown}),
+        "results": [row for key, row in rows.items() if key in shown],
+        "up-to-2000": [row for key, row in rows.items() if key not in shown and key[1] <= 2000],
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
         "baselines": baseline_rows("move", 2000),

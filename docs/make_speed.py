@@ -102,8 +102,9 @@ def of_scale() -> str:
         ]
         text = (
             "A model of BabyAI practice, 64 worlds a worker, 1 Gbit/s, from one process's times. "
-            "Workers wait while the learner receives and learns: it is the limit above "
-            f"{limit['frames/s']:.1f} workers or, if learning took no time, {limit['bound']:.0f}."
+            "Workers wait while the learner receives and learns: beyond "
+            f"{limit['frames/s']:.1f} workers it is the bottleneck, beyond {limit['bound']:.0f} if "
+            "learning took no time."
         )
         parts += [text, markdown_table(model)]
     return "\n\n".join(parts)
