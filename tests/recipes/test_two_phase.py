@@ -85,6 +85,8 @@ def test_both_phases_run_on_a_gpu(options, preset):
     from two_phase import two_phase
 
     few = ["evaluate.episodes=10", "evaluate.mode=greedy", "self_examine.iterations=1"]
+    few += ["evaluate.max_steps=4", "evaluate.states=4", "evaluate.audit_episodes=4"]
+    few += ["imitate.steps=4", "inverse.steps=4", "self_examine.steps=4", "transitions.n=100"]
     with pretended_gpu():
         results = two_phase(options(f"preset={preset}", "device=cuda", *few))
     assert results["phase2"]["rate"]["count"] == 10
