@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -28,12 +29,16 @@ def in_mode(training: bool, *modules: object) -> Iterator[None]:
     with TURNS:
         before = [part.training for part in parts]
         try:
-            for part in parts:
-                part.training = training
+            _set_modes(parts, [training] * len(parts))
             yield
         finally:
-            for part, was in zip(parts, before, strict=True):
-                part.training = was
+            _set_modes(parts, before)
+
+
+def _set_modes(parts: list[nn.Module], modes: list[bool]) -> None:
+    for part, mode in zip(parts, modes, strict=True):
+        if part.training is not mode:  # to set an attribute of a module is slow
+            part.training = mode
 
 
 @contextlib.contextmanager
@@ -68,7 +73,7 @@ def device_of(module: object) -> torch.device | None:
     (device(type='cpu'), None)
     """
     if isinstance(module, nn.Module):
-        for tensor in (*module.parameters(), *module.buffers()):
+        for tensor in itertools.chain(module.parameters(), module.buffers()):
             return tensor.device
     return None
 
