@@ -163,7 +163,7 @@ def test_the_package_is_the_command_too(module, capsys, monkeypatch):
 
 
 def test_help_ends_where_its_reader_does():
-    command = [sys.executable, "-m", "ifo_grounding", "--help"]
+    command = [sys.executable, str(recipes_folder() / "imitate.py"), "--help"]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout and process.stderr

@@ -198,6 +198,7 @@ def test_a_recipe_collects_the_same_where_a_worker_has_died(one_machine, options
     killed = []
     undisturbed = examined("undisturbed")
     assert len(undisturbed) == 2 and undisturbed[-1]["states_served"] >= 8
+    assert "selection_return" in undisturbed[-1]
     soon(lambda: not processes("Worker"))
     killer = threading.Thread(target=kill)
     killer.start()

@@ -58,12 +58,29 @@ def test_an_option_that_is_gone_is_of_another_version(tmp_path):
         run.begin({**OPTIONS, "imitate": {"lr": 1e-5}})
 
 
-@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"a: [1", b"- a\n", b"x: ${nothing}\n", b""])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(b"\xff\xfe\x00", b"a: [1", b"- a\n", b"x: ${nothing}\n", b""),
+        *(b"seed: 1\nseed: 2\n", b"a: !!bool maybe\n"),
+    ],
+)
 def test_damaged_options_are_one_line(tmp_path, content):
     (tmp_path / "config.yaml").write_bytes(content)
     with pytest.raises(UserError, match=r"config\.yaml is damaged|another version") as error:
         Run(tmp_path).begin(OPTIONS)
     assert "\n" not in str(error.value)
+
+
+def test_options_are_read_anew_where_their_file_has_changed(tmp_path):
+    run = Run(tmp_path)
+    (run / "config.yaml").write_text("lr: 1e-3\nlevels: [a]\n")
+    found = run.options()
+    assert found == {"lr": 0.001, "levels": ["a"]}
+    found["levels"].append("b")
+    assert run.options() == {"lr": 0.001, "levels": ["a"]}  # what one asks for is its own
+    (run / "config.yaml").write_text("lr: 2e-3\nlevels: [a]\n")
+    assert run.options() == {"lr": 0.002, "levels": ["a"]}
 
 
 def test_a_stage_is_done_when_its_record_is_there(tmp_path):

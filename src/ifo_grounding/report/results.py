@@ -87,9 +87,8 @@ def _measurements(results: Mapping[str, Any]) -> Iterator[tuple[str, Any, Any]]:
 
 def meaning(measured: str) -> str:
     """Return what a row of results means, nothing where that is not said."""
-    return MEANINGS.get(
-        max((name for name in MEANINGS if measured.startswith(name)), default=""), ""
-    )
+    names = [name for name in MEANINGS if measured.startswith(name)]
+    return MEANINGS[max(names)] if names else ""
 
 
 def headline(results: Mapping[str, Any]) -> dict[str, Any]:

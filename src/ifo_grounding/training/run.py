@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import fcntl
+import functools
 import os
 import platform
 import shutil
@@ -15,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from ifo_grounding.errors import UserError, check_choice, first_line, optional
 from ifo_grounding.files import (
@@ -42,8 +43,6 @@ NOT_TAKEN = (OPTIONS, "logs", "checkpoints", "report", "result.json", ".*")
 WRITTEN = ("stages", "metrics", "logs", "report", "report/pictures", "checkpoints/*")
 """Folders in a run's folder in which files are written."""
 NUMBERS = (int, float)
-YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""In C where PyYAML has it: ten times as fast."""
 _HELD: set[Path] = set()
 """Folders of the runs that this process has locked."""
 
@@ -142,11 +141,12 @@ class Run:
                 f"run={self.name!s:.40}... names no folder ({error.strerror})"
             ) from None
         try:
-            options = yaml.load(path.read_text(), YAML)
+            file = path.stat()
+            options = _read_options(path.resolve(), file.st_ino, file.st_mtime_ns, file.st_size)
             if isinstance(options, dict):
-                return {str(name): value for name, value in options.items()}
+                return {str(name): copy.deepcopy(value) for name, value in options.items()}
             why = "it holds no options"
-        except (OSError, ValueError, yaml.YAMLError) as error:
+        except Exception as error:  # of YAML, of OmegaConf, of the file
             why = first_line(error)
         raise UserError(f"{path} is damaged ({why}): restore it, or give another run=")
 
@@ -160,10 +160,12 @@ class Run:
         Raises:
             UserError: where the run was made with another value, or its file is damaged.
         """
+        from omegaconf import OmegaConf
+
         made = self.options()
         if made is None:
             with atomic_write(self / OPTIONS) as temporary:
-                temporary.write_text(yaml.safe_dump(options, sort_keys=False, allow_unicode=True))
+                OmegaConf.save(OmegaConf.create(options), temporary)
         elif found := difference(made, options, free):
             raise UserError(f"the run {self.name} was {found}, or give another run=")
 
@@ -239,6 +241,14 @@ class Run:
         for entry in [*taken.iterdir()]:  # a killed process may have left some of them to move
             entry.replace(self / entry.name)
         taken.rmdir()
+
+
+@functools.lru_cache(maxsize=8)
+def _read_options(path: Path, *_state: int) -> Any:
+    """Read a ``config.yaml``, which every stage asks for, once for each state of the file."""
+    from omegaconf import OmegaConf
+
+    return OmegaConf.to_container(OmegaConf.load(path), resolve=True)
 
 
 class Stage:
