@@ -14,7 +14,7 @@ from ifo_grounding.errors import at_least_one, check_choice
 from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
-from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
+from ifo_grounding.tasks.scenes import Scene, SceneOptions, draw_scenes
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import step
 from ifo_grounding.world.tiles import TILE_SIZES, tile_index, tile_table
@@ -58,7 +58,6 @@ def record_demonstrations(
     check_choice("tile size", tile_size, TILE_SIZES)
     n = at_least_one("the number of demonstrations", n)
     options = SceneOptions(task=task, **scenes)
-    drawn = SceneStream(options, derive(seed, "demonstrations"))
     parts: list[Tensor] = []
     lengths, instructions, actions = [], [], []
     bar = progress_bar(total=n, desc="record", shown=progress)
@@ -66,7 +65,8 @@ def record_demonstrations(
     torch.set_num_threads(1)  # for steps this small, threads wait more than they work
     try:
         for first in range(0, n, BATCH):
-            batch = drawn.scenes(torch.arange(first, min(n, first + BATCH)))
+            numbers = torch.arange(first, min(n, first + BATCH))
+            batch = draw_scenes(options, derive(seed, "demonstrations"), numbers)
             ties = generator(seed, "demonstrations", options.stream, "ties", first)
             frames, taken = _demonstrate(batch, ties)
             parts.append(frames)

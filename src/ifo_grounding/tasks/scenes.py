@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -29,10 +30,10 @@ from ifo_grounding.world import Layout, WorldState, random_layout
 
 PATIENCE = 1000
 """Draws for each scene after which a layout counts as unable to hold a suitable goal."""
-FEWEST = 4096
+FEWEST = 1024
 """Scenes that are drawn at once at least: fewer take as long."""
-BLOCKS_KEPT = 16
-"""Blocks of so many scenes that a stream remembers."""
+BLOCKS_KEPT = 64
+"""Blocks of so many scenes that are remembered."""
 
 
 class Scene(TensorClass):
@@ -125,7 +126,7 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
     width = max(len(left), FEWEST)
     found: list[Any] = []
     places: list[Tensor] = []
-    tried = drawn = 0
+    times, tried, drawn = 1, 0, 0
     while not found or len(left):
         if drawn >= PATIENCE * width:
             raise UserError(
@@ -134,7 +135,6 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
                 f"{options.max_steps} steps: give the layout more objects or boxes, or episodes "
                 "more steps"
             )
-        times = width // len(left) if tried else 1
         draws = torch.arange(tried, tried + times, device=left.device).repeat(len(left))
         lots = Lots(key, numbers[left].repeat_interleave(times), draws)
         proposal, good = _propose(options, lots)
@@ -142,6 +142,9 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
         found.append(proposal[(torch.arange(len(left), device=left.device) * times + first)[has]])
         places.append(left[has])
         left, tried, drawn = left[~has], tried + times, drawn + len(lots)
+        if len(left):  # few passes, and few draws in vain
+            enough = max(2 * times, width // 4 // len(left))
+            times = min(enough, 4 * width // len(left))
     every: Any = torch.cat(found)
     every = every[torch.cat(places).argsort()]
     said = grammar(options.task).encode(every.goal, every.wording)
@@ -220,22 +223,19 @@ class SceneStream:
         self, options: SceneOptions, seed: int, device: torch.device | str | None = None
     ) -> None:
         self.options, self.seed, self.device = options, seed, torch.device(device or "cpu")
-        self._blocks: dict[int, Scene] = {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_blocks": {}}  # a copy draws its scenes again
 
     def scenes(self, numbers: Tensor) -> Scene:
         """Return the scenes with the given numbers, int64 [N] from 0 on."""
         blocks, which = (numbers // FEWEST).unique(return_inverse=True)
-        parts: list[Any] = [self._block(block) for block in blocks.tolist() or [0]]
+        parts: list[Any] = [
+            _block(self.options, self.seed, block, self.device) for block in blocks.tolist() or [0]
+        ]
         every: Any = parts[0] if len(parts) == 1 else torch.cat(parts)
         return every[which * FEWEST + numbers % FEWEST]
 
-    def _block(self, block: int) -> Scene:
-        if block not in self._blocks:
-            if len(self._blocks) == BLOCKS_KEPT:
-                del self._blocks[next(iter(self._blocks))]
-            numbers = torch.arange(block * FEWEST, (block + 1) * FEWEST, device=self.device)
-            self._blocks[block] = draw_scenes(self.options, self.seed, numbers)
-        return self._blocks[block]
+
+@functools.lru_cache(maxsize=BLOCKS_KEPT)
+@torch.inference_mode(False)
+def _block(options: SceneOptions, seed: int, block: int, device: torch.device) -> Scene:
+    numbers = torch.arange(block * FEWEST, (block + 1) * FEWEST, device=device)
+    return draw_scenes(options, seed, numbers)

@@ -48,6 +48,8 @@ class Layout:
         share("inside", self.inside)
         if not set(range(1, N_KINDS + 1)) - set(self.excluded_kinds):
             raise UserError("excluded_kinds leaves no kind of object")
+        for name in ("objects", "boxes", "excluded_kinds"):  # equal layouts are one, hashable
+            object.__setattr__(self, name, tuple(getattr(self, name)))
 
 
 def random_layout(lots: Lots, layout: Layout | None = None) -> WorldState:
