@@ -155,16 +155,17 @@ def _settled(overrides: Sequence[str]) -> Options:
     the run is opened.
     """
     words = [quoted(word) for word in overrides]
-    parsed = OverridesParser.create().parse_overrides(words)
-    named = {each.key_or_group: each.value() for each in parsed}
+    named = {e.key_or_group: e.value() for e in OverridesParser.create().parse_overrides(words)}
     counted = not {"demonstrations.n", "recorded", "world"}.isdisjoint(named)
     free = named.get("preset", "strong") == "strong" and "budget" not in named
+    n, few = named.get("demonstrations.n"), ["budget=few"]
+    known = few if isinstance(n, int) and n < FEW else [] if counted else ["budget=demo"]
     words += [f"~hydra/{group}" for group in UNREAD]
-    cfg = compose(CONFIG, [*words, *["budget=demo"] * (free and not counted)])
+    cfg = compose(CONFIG, words + known * free)
     _refuse_unknown(cfg)
     number = _demonstrations(cfg)
-    if free and counted and number < FEW:
-        cfg = compose(CONFIG, [*words, "budget=few"])
+    if free and not known and number < FEW:
+        cfg = compose(CONFIG, words + few)
     if counted:  # all that were recorded, not as many as the budget would record
         cfg.demonstrations.n = number
     made = Run(cfg.run).options()
