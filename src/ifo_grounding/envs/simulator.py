@@ -84,15 +84,10 @@ class Simulator:
     @torch.inference_mode(False)
     def seed(self, seed: int) -> None:
         """Go to the first scene of the stream of this seed."""
-        if not self._streams(seed):  # else it remembers what it has drawn
-            self.stream = SceneStream(self.options, seed, self.device)
+        self.stream = SceneStream(self.options, seed, self.device)
         self._next = torch.zeros((), dtype=torch.int64, device=self.device)
         self._ahead: list[Tensor] = []
         self._drawn = self._most = 0
-
-    def _streams(self, seed: int) -> bool:
-        stream = getattr(self, "stream", None)
-        return stream is not None and (stream.seed, stream.options) == (seed, self.options)
 
     @torch.inference_mode(False)
     def to(self, device: torch.device | str) -> Simulator:
