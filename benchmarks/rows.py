@@ -30,7 +30,6 @@ from ifo_grounding.data import (
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.envs.simulator import AHEAD, Simulator
 from ifo_grounding.files import read_json
-from ifo_grounding.machine import choose_threads
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.seeding import Lots
 from ifo_grounding.tasks import SceneOptions, grammar
@@ -355,31 +354,6 @@ def imitation(preset: str) -> Row:
     )
 
 
-def busy_core() -> Row:
-    """Imitate with the threads that a command chooses while another process keeps a core busy."""
-    alone = imitation("strong").contenders["ifo-grounding"]
-
-    def beside() -> tuple[float, float]:
-        busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-        try:
-            choose_threads("auto")
-            return alone()
-        finally:
-            busy.kill()
-            busy.wait()
-
-    def free() -> tuple[float, float]:
-        choose_threads(1)
-        return alone()
-
-    return Row(
-        "imitation, preset strong, beside a busy core",
-        "samples/s",
-        {"ifo-grounding": beside, "one thread, alone": free},
-        {"one thread, alone": 0.7},
-    )
-
-
 def labelling() -> Row:
     demos, _ = record_demonstrations("move", 4000, seed=0, keep_truth=True)
     inverse = networks.make_inverse(demos, "strong", seed=0, device=DEVICE)
@@ -560,7 +534,6 @@ ROWS: dict[str, Callable[[], Row]] = {
     "collector-paper": functools.partial(collector, "paper", 512, 10),
     "sampler": sampler,
     **{f"imitation-{preset}": functools.partial(imitation, preset) for preset in PRESETS},
-    "busy-core": busy_core,
     "labelling": labelling,
     "transitions": random_steps,
     "recording": recording,

@@ -12,7 +12,7 @@ from ifo_grounding.report import markdown_table
 OURS = "ifo-grounding"
 ORDER = (
     *("step", "pixels", "worlds", "worlds-pixels", "rollout", "gymnasium", "collector-strong"),
-    *("collector-paper", "sampler", "imitation-strong", "imitation-paper", "busy-core"),
+    *("collector-paper", "sampler", "imitation-strong", "imitation-paper"),
     *("labelling", "transitions", "recording", "memory", "whole", "growth"),
 )
 """Of the rows in the tables; others come last."""

@@ -22,7 +22,7 @@ from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import read_json, write_json, write_record
-from ifo_grounding.machine import choose_threads, machine_of
+from ifo_grounding.machine import machine_of
 from ifo_grounding.options import plain
 from ifo_grounding.progress import tell_progress
 from ifo_grounding.training import FitConfig, Run, Stage, Trial, fit
@@ -115,7 +115,7 @@ def open_stage(options: Options, name: str) -> Stage:
     """Return a stage of the run, and say whether it is done."""
     release_freed_memory()  # of the stage before
     stage = open_run(options, name).stage(name)
-    choose_threads(options.threads)
+    torch.set_num_threads(options.threads)
     if options.progress:
         tell_progress(name)
     print(f"{name}: {'running' if stage.result is None else 'done before'}", flush=True)

@@ -86,7 +86,7 @@ def test_start_ends_with_a_policy_of_the_readers_own_world(tmp_path, monkeypatch
     with recipes_importable():
         from two_phase import two_phase
 
-        two_phase(options_of(*given, "budget=tiny", "threads=1", "progress=false"))
+        two_phase(options_of(*given, "budget=tiny", "progress=false"))
     runpy.run_path("ask.py")
     assert "tensor(" in capsys.readouterr().out
 

@@ -57,7 +57,7 @@ def sections():
         ("until=imitat", "unknown until 'imitat'"),
         ("logger=wandbb", "unknown logger"),
         ("threads=100000", "threads must be at most 1024"),
-        ("threads=several", "threads must be a whole number"),
+        ("threads=several", "option threads: value .several. .* could not be converted to Integer"),
         ("checkpoint_seconds=nan", "checkpoint_seconds"),
         ("device=gpu", "device=gpu is none: use cpu, cuda or cuda:0"),
         ("variant=../../x", "variant"),

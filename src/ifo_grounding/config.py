@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from ifo_grounding.baselines.config import METHODS, BaselineConfig
-from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range, whole
+from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks.config import NetworksConfig
 from ifo_grounding.seeding import STREAMS
@@ -264,8 +264,9 @@ class Options:
     """Of all randomness."""
     device: str = "cpu"
     """``cpu`` or ``cuda``."""
-    threads: int | str = "auto"
-    """Threads of torch; ``auto`` takes one, or all where each stage begins faster with them."""
+    threads: int = 1
+    """Threads of torch. More can pay for large batches on idle cores, and change results by
+    rounding."""
     run: str = "${task}-${preset}-${budget}-seed${seed}"
     """Name of the run's folder under the home folder, or a path."""
     base: str | None = None
@@ -314,9 +315,7 @@ class Options:
         check_choice("logger", self.logger, LOGGERS)
         check_choice("until", self.until, (None, *STAGES))
         check_choice("method", self.method, METHODS)
-        if self.threads != "auto":
-            whole("threads", self.threads)
-            check_range(self, "threads", least=1, most=1024)
+        check_range(self, "threads", least=1, most=1024)
         check_range(self, "checkpoint_seconds", least=0, most=86_400)
         if not str(self.run).strip() or Path(self.run).expanduser().resolve() == Path("/"):
             raise UserError("run needs a name, or the path of a folder")

@@ -25,9 +25,7 @@ def page_of_a_run(tmp_path_factory):
 
         from report import report
 
-        options = options_of(
-            "task=pick", "budget=tiny", f"run={run}", "progress=false", "threads=1"
-        )
+        options = options_of("task=pick", "budget=tiny", f"run={run}", "progress=false")
         two_phase(options)
         return report(options)
 

@@ -6,7 +6,7 @@ from ifo_grounding.options import options_of
 from importing import recipes_importable
 
 TINY = (
-    *("budget=tiny", "progress=false", "threads=1", "logger=none", "networks.features=16"),
+    *("budget=tiny", "progress=false", "logger=none", "networks.features=16"),
     *("demonstrations.n=60", "transitions.n=500", "imitate.trials=1", "instruction.trials=1"),
     *("instruction.threshold=0.01", "instruction.steps=5", "goal.steps=5", "reward.steps=5"),
     *(f"{stage}.batch_size=32" for stage in ("inverse", "imitate", "instruction", "goal")),

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 
 from ifo_grounding.errors import UserError
-from ifo_grounding.machine import review_threads
 from ifo_grounding.progress import progress_bar
 from ifo_grounding.training.checkpoint import Checkpoint
 
@@ -65,7 +64,6 @@ class Loop:
             )
         self.done += 1
         self.history.append(metrics)
-        review_threads()
         if self.log:
             self.log(metrics, step)
         due = time.monotonic() - self._last_save > self.seconds or self.done >= self.iterations
