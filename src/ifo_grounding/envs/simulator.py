@@ -166,7 +166,7 @@ class Simulator:
         ahead lies at its number modulo their count.
         """
         on_cpu = self.device.type == "cpu"
-        count = max(4 * FEWEST, self.num_envs * (2 if on_cpu else AHEAD))
+        count = max(16 * FEWEST, self.num_envs * (2 if on_cpu else AHEAD))
         if on_cpu or self._most + self.num_envs > self._drawn:
             self._most = int(self._next)
         if self._most + self.num_envs > self._drawn:
