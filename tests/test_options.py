@@ -58,6 +58,7 @@ def sections():
         ("logger=wandbb", "unknown logger"),
         ("threads=100000", "threads must be at most 1024"),
         ("threads=several", "option threads: value .several. .* could not be converted to Integer"),
+        ("hydra/launcher=foo", "unknown hydra/launcher 'foo'"),
         ("checkpoint_seconds=nan", "checkpoint_seconds"),
         ("device=gpu", "device=gpu is none: use cpu, cuda or cuda:0"),
         ("variant=../../x", "variant"),
@@ -164,3 +165,9 @@ def test_tiny_records_and_plays_little_on_every_level():
     tiny = options_of("world=babyai", "level=BossLevel", "budget=tiny")
     assert tiny.demonstrations.n <= 16  # its bot takes half a minute for these
     assert tiny.evaluate.max_steps * tiny.evaluate.episodes <= 1000
+
+
+@pytest.mark.parametrize("threads", [2.5, True, None, "auto"])
+def test_threads_are_a_whole_number_in_python_too(threads):
+    with pytest.raises(UserError, match="threads must be a whole number"):
+        dataclasses.replace(options_of("budget=tiny"), threads=threads)

@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from ifo_grounding.baselines.config import METHODS, BaselineConfig
-from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
+from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range, whole
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks.config import NetworksConfig
 from ifo_grounding.seeding import STREAMS
@@ -315,6 +315,7 @@ class Options:
         check_choice("logger", self.logger, LOGGERS)
         check_choice("until", self.until, (None, *STAGES))
         check_choice("method", self.method, METHODS)
+        whole("threads", self.threads)
         check_range(self, "threads", least=1, most=1024)
         check_range(self, "checkpoint_seconds", least=0, most=86_400)
         if not str(self.run).strip() or Path(self.run).expanduser().resolve() == Path("/"):

@@ -160,7 +160,7 @@ def _settled(overrides: Sequence[str]) -> Options:
     free = named.get("preset", "strong") == "strong" and "budget" not in named
     n, few = named.get("demonstrations.n"), ["budget=few"]
     known = few if isinstance(n, int) and n < FEW else [] if counted else ["budget=demo"]
-    words += [f"~hydra/{group}" for group in UNREAD]
+    words += [f"~hydra/{group}" for group in UNREAD if "hydra" not in " ".join(named)]
     cfg = compose(CONFIG, words + known * free)
     _refuse_unknown(cfg)
     number = _demonstrations(cfg)

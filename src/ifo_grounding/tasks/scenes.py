@@ -144,7 +144,7 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
         left, tried, drawn = left[~has], tried + times, drawn + len(lots)
         if len(left):  # few passes, and few draws in vain
             enough = max(2 * times, width // 4 // len(left))
-            times = min(enough, 4 * width // len(left))
+            times = min(enough, 2 * width // len(left))
     every: Any = torch.cat(found)
     every = every[torch.cat(places).argsort()]
     said = grammar(options.task).encode(every.goal, every.wording)
