@@ -9,13 +9,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import torch
 from measuring import ROOT, Once, Peer, Row, median_time, peak_memory, resident_memory, timed
+from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
@@ -26,6 +27,7 @@ from ifo_grounding.data import (
     label_demonstrations,
     labelled_buffer,
     record_demonstrations,
+    show_codes,
 )
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.envs.simulator import AHEAD, Simulator
@@ -248,23 +250,31 @@ def gymnasium_vector() -> Row:
 
 
 def collector(preset: str, batch: int, steps: int) -> Row:
-    env = PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE)
-    policy = networks.make_policy(env, preset, seed=0, device=DEVICE)
-    source = Collector(
-        env,
-        policy,
-        frames_per_batch=batch * steps,
-        total_frames=-1,
-        trust_policy=True,
-        auto_register_policy_transforms=False,
-        return_same_td=DEVICE == "cpu",  # as in self-examination: a batch is used and let go of
+    coded, plain = (
+        PickAndPlaceEnv("move", num_envs=batch, seed=0, device=DEVICE, codes=codes)
+        for codes in (True, False)
     )
-    batches = iter(source)
+    policy = networks.make_policy(coded, preset, seed=0, device=DEVICE)
+
+    def batches_of(env: PickAndPlaceEnv) -> Iterator[TensorDict]:
+        return iter(
+            Collector(
+                env,
+                policy,
+                frames_per_batch=batch * steps,
+                total_frames=-1,
+                trust_policy=True,
+                auto_register_policy_transforms=False,
+                return_same_td=DEVICE == "cpu",  # as in self-examination, which lets go of it
+            )
+        )
+
+    batches, drawn = batches_of(coded), batches_of(plain)
     observed = next(batches).select(keys.PIXELS, keys.INSTRUCTION)
     seen = [each.clone() for each in observed.unbind(1)]  # as the policy gets them, each in a row
 
-    def collect() -> float:
-        next(batches)
+    def collect(some: Iterator[TensorDict]) -> float:
+        next(some)
         return batch * steps
 
     @torch.no_grad()
@@ -276,9 +286,13 @@ def collector(preset: str, batch: int, steps: int) -> Row:
     return Row(
         f"Collector, preset {preset}, batch {batch:,}",
         "frames/s",
-        {**ours(collect), "the policy alone": finished(infer)},
+        {
+            **ours(functools.partial(collect, batches)),
+            "the policy alone": finished(infer),
+            "drawn in pixels": finished(functools.partial(collect, drawn)),
+        },
         {"the policy alone": 0.8, **({"rate": 3e6} if batch == 16_384 else {})},
-        "the policy alone: on the same observations",
+        "ours in codes, as self-examination collects; the policy alone: on the same observations",
     )
 
 
@@ -321,8 +335,11 @@ def imitation(preset: str) -> Row:
     # How fast a network learns does not depend on the labels; these are random.
     actions = torch.randint(6, (demos.transitions,), dtype=torch.uint8)
     buffer = labelled_buffer(demos, actions)
+    coded = PickAndPlaceEnv(device=DEVICE, codes=preset == "strong")  # as the recipe reads
+    if coded.tiles is not None:
+        show_codes(buffer, coded.tiles)
     buffer.transform.to(DEVICE)
-    policy = networks.make_policy(demos, preset, seed=0, device=DEVICE)
+    policy = networks.make_policy(coded, preset, seed=0, device=DEVICE)
     config = FitConfig(steps=steps, batch_size=size, iteration=steps, schedule="constant")
 
     def work() -> float:

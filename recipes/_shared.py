@@ -17,9 +17,10 @@ from torchrl import torchrl_logger
 
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
+from ifo_grounding.attributes import attribute
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import FREE, STAGES, Options
-from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport
+from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport, show_codes
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import read_json, write_json, write_record
 from ifo_grounding.machine import machine_of
@@ -152,10 +153,15 @@ def simulator_of(options: Options, num_envs: int = 1) -> Any:
     return world_of(options).simulator(num_envs, seed=options.seed, device=options.device)
 
 
+def coded_simulator(options: Options, num_envs: int = 1) -> Any:
+    """Return the same, in codes instead of pixels where the world has them."""
+    return world_of(options).coded(num_envs, seed=options.seed, device=options.device)
+
+
 def build(make: Any, options: Options, **kwargs: Any) -> Any:
     """Build a network for the simulator's images, words and actions."""
     chosen = {"seed": options.seed, "device": options.device, **options.networks.changed()}
-    network = make(simulator_of(options), options.preset, **{**chosen, **kwargs})
+    network = make(coded_simulator(options), options.preset, **{**chosen, **kwargs})
     if network.network_config.shapes.fit(words := world_of(options).vocabulary):
         network.vocabulary = words
     return network
@@ -171,7 +177,7 @@ def learn(
     **kwargs: Any,
 ) -> dict[str, Any]:
     """Fit a network to a buffer, save it, and finish the stage."""
-    decode_on(options.device, buffer)
+    read_fast(buffer, options)
     how = {"checkpoint": stage.checkpoint, "log": stage.log(), **fit_options(options, stage)}
     history = fit(loss, buffer, config, **how, **kwargs)
     save_network(stage.run, file, loss.network)
@@ -208,14 +214,16 @@ def finish(options: Options, stage: Stage, result: dict[str, Any], history: Any 
     return stage.finish(result, history, machine=machine_of(options.device))
 
 
-def decode_on(device: str, buffer: Any) -> None:
-    """Let a buffer keep its frames on a GPU and decode them there, unless they are pixels."""
-    transform = getattr(buffer, "transform", None)
-    if transform is None or torch.device(device).type == "cpu":
+def read_fast(buffer: Any, options: Options) -> None:
+    """Let a buffer give codes of the simulator's, where it has them, and keep frames on a GPU."""
+    if getattr(buffer, "transform", None) is None:
         return
-    parts = [part for part in transform.modules() if isinstance(part, FrameDecoder)]
-    if all(part.table is not None for part in parts):
-        transform.to(device)
+    if (tiles := attribute(coded_simulator(options), "tiles")) is not None:
+        show_codes(buffer, tiles)
+    parts = [part for part in buffer.transform.modules() if isinstance(part, FrameDecoder)]
+    gpu = torch.device(options.device).type != "cpu"
+    if gpu and all(part.table is not None for part in parts):  # else frames are pixels
+        buffer.transform.to(options.device)
 
 
 def checksums(run: Run) -> dict[str, str]:
@@ -231,7 +239,10 @@ def save_network(run: Run, name: str, network: Any) -> None:
 def load_network(run: Run, name: str, recipe: str, options: Options) -> TensorDictModuleBase:
     """Load a network that an earlier recipe trained; another run's is refused."""
     path, checksum = run.need(name, recipe), checksums(run).get(name)
-    return networks.load(path, device=options.device, checksum=checksum)
+    network = networks.load(path, device=options.device, checksum=checksum)
+    if (tiles := attribute(coded_simulator(options), "tiles")) is not None:
+        networks.read_codes(network, tiles)
+    return network
 
 
 def starting_policy(run: Run, options: Options, warm_start: bool) -> Any:

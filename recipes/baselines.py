@@ -250,7 +250,8 @@ def adversarial(options: Options) -> Run:
     if method == "agile":
         env = seen.starts(options.seed)
     else:
-        env = TransformedEnv(simulator_of(options, worlds), chosen_starts(run, options))
+        starts = chosen_starts(run, options, simulator_of)  # demonstrations are read as pixels
+        env = TransformedEnv(simulator_of(options, worlds), starts)
     history = improve_policy(
         env.append_transform(adversary.reward),
         policy,

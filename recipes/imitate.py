@@ -6,12 +6,12 @@ from typing import Any
 from _shared import (
     POLICIES,
     build,
-    decode_on,
     fit_options,
     keep,
     load_demonstrations,
     load_labels,
     open_stage,
+    read_fast,
     tell,
 )
 from torch import Tensor
@@ -48,7 +48,7 @@ def imitate_transitions(
     What else was found goes into the stage's record.
     """
     section = options.imitate
-    decode_on(options.device, seen)
+    read_fast(seen, options)
 
     def trial(number: int) -> Trial:
         policy = build(

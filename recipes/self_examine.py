@@ -13,13 +13,14 @@ from _shared import (
     VALUE,
     build,
     chosen_by,
+    coded_simulator,
     finish,
     load_demonstrations,
     load_labels,
     load_network,
     open_stage,
+    read_fast,
     save_network,
-    simulator_of,
     tell,
     world_of,
 )
@@ -57,6 +58,7 @@ def examine(options: Options) -> dict:
     env = paid_simulator(reward, run, options)
     # What demonstrations add: an imitation loss beside the reward, and accuracy on those held out.
     seen, aside = labelled_demonstrations(run, options.imitate.held_out)
+    read_fast(seen, options)
     weight = section.imitation_weight
     imitation = AuxiliaryImitation(ImitationLoss(policy), seen, weight) if weight else None
     history = self_examine(
@@ -82,7 +84,7 @@ def examine(options: Options) -> dict:
 
 def paid_simulator(reward: LearnedReward | GoalReward, run: Run, options: Options) -> EnvBase:
     """Return the simulator with chosen instructions and a learned reward."""
-    simulator = simulator_of(options, options.self_examine.num_envs)
+    simulator = coded_simulator(options, options.self_examine.num_envs)
     return TransformedEnv(simulator, Compose(chosen_starts(run, options), reward))
 
 
@@ -95,7 +97,7 @@ def remote_simulators(run: Run, options: Options) -> list[Callable[[], EnvBase]]
     starts, reward = chosen_starts(run, here), learned_reward(run, here)
 
     def make() -> EnvBase:
-        return TransformedEnv(world.simulator(rows, seed=here.seed), Compose(starts, reward))
+        return TransformedEnv(world.coded(rows, seed=here.seed), Compose(starts, reward))
 
     return [make] * section.collectors
 
@@ -108,7 +110,9 @@ def learned_reward(run: Run, options: Options) -> LearnedReward | GoalReward:
     return GoalReward(classifier, stop_action=world_of(options).stop_action)
 
 
-def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPairs:
+def chosen_starts(
+    run: Run, options: Options, simulator: Callable[..., Any] = coded_simulator
+) -> InstructionSampler | StartingPairs:
     """Return fresh states with chosen instructions, or the paper's fixed number of pairs."""
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
     pool, section = load_demonstrations(run).pool(), options.self_examine
@@ -116,7 +120,7 @@ def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPa
         return InstructionSampler(classifier, pool, **chosen_by(options))
     with torch.no_grad():
         pairs = select_pairs(
-            simulator_of(options, section.num_envs),
+            simulator(options, section.num_envs),
             classifier,
             pool,
             section.pairs,

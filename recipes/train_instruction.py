@@ -6,12 +6,12 @@ import torch
 from _shared import (
     CLASSIFIER,
     build,
-    decode_on,
+    coded_simulator,
     fit_options,
     keep,
     load_demonstrations,
     open_stage,
-    simulator_of,
+    read_fast,
     starting_policy,
     tell,
 )
@@ -35,7 +35,7 @@ def train_instruction(options: Options) -> dict:
         return stage.result
     demos = load_demonstrations(stage.run)
     states, seen = fresh_states(options, len(demos)), first_frame_buffer(demos)
-    decode_on(options.device, seen)
+    read_fast(seen, options)
     trials = [
         Trial(number, loss, seen, section, stage.trial(number), **fit_options(options, stage))
         for number, loss in enumerate(losses(options, stage.run, demos, states))
@@ -91,7 +91,7 @@ def fresh_states(options: Options, demonstrations: int) -> Tensor | None:
     wanted = options.instruction.fresh_states
     if demonstrations >= wanted:
         return None
-    simulator = simulator_of(options, min(wanted, STATES_AT_ONCE))
+    simulator = coded_simulator(options, min(wanted, STATES_AT_ONCE))
     frames = [simulator.reset()[PIXELS] for _ in range(math.ceil(wanted / STATES_AT_ONCE))]
     return torch.cat(frames)[:wanted]
 

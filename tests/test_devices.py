@@ -9,7 +9,7 @@ from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding import data, networks
 from ifo_grounding.envs import PickAndPlaceEnv
-from ifo_grounding.objectives import GoalLoss, ImitationLoss, InstructionLoss
+from ifo_grounding.objectives import GoalLoss, ImitationLoss, InstructionLoss, InverseLoss
 from ifo_grounding.training.updates import total_loss
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 from pretended_gpu import pretended_gpu
@@ -122,13 +122,47 @@ def test_a_step_and_a_reset_ask_a_gpu_nothing():
     assert not asking.noted & WAITS
 
 
-@pytest.mark.parametrize("preset", ["paper", "strong"])
-def test_a_step_of_imitation_asks_a_gpu_nothing(preset):
+def labelled(codes):
+    """Return an environment, and demonstrations as it shows things."""
     demos, truth = data.record_demonstrations("pick", 20, seed=0, keep_truth=True)
-    batch = data.labelled_buffer(demos, truth.actions)[:]
+    env, buffer = PickAndPlaceEnv(codes=codes), data.labelled_buffer(demos, truth.actions)
+    if codes:
+        data.show_codes(buffer, env.tiles)
+    return env, buffer[:]
+
+
+def test_codes_mean_the_same_on_a_gpu_which_looks_at_all_tiles():
+    env, batch = labelled(codes=True)
+
+    def losses(device):
+        loss = ImitationLoss(networks.make_policy(env, seed=0, device=device))
+        torch.manual_seed(0)
+        words = loss(batch.to(device))["loss_words"]  # of the tiles that are shown
+        return float(words), float(loss.eval()(batch.to(device))["loss_imitation"])
+
+    here = losses("cpu")
     with pretended_gpu():
-        loss = ImitationLoss(networks.make_policy(demos, preset, seed=0, device="cuda"))
+        assert losses("cuda") == pytest.approx(here, rel=0.01)
+
+
+@pytest.mark.parametrize("codes", [False, True])
+@pytest.mark.parametrize("preset", ["paper", "strong"])
+def test_a_step_of_imitation_asks_a_gpu_nothing(preset, codes):
+    env, batch = labelled(codes)
+    with pretended_gpu():
+        loss = ImitationLoss(networks.make_policy(env, preset, seed=0, device="cuda"))
         with Asking() as asking:
             total_loss(loss(batch.to("cuda"))).backward()
     assert "mm" in asking.noted or "addmm" in asking.noted
+    assert not asking.noted & WAITS
+
+
+@pytest.mark.parametrize("codes", [False, True])
+def test_a_step_of_the_inverse_model_asks_a_gpu_nothing(codes):
+    env = PickAndPlaceEnv(num_envs=4, codes=codes, seed=0)
+    batch = env.rollout(5, break_when_any_done=False).reshape(-1)
+    with pretended_gpu():
+        loss = InverseLoss(networks.make_inverse(env, seed=0, device="cuda"))
+        with Asking() as asking:
+            total_loss(loss(batch.to("cuda"))).backward()
     assert not asking.noted & WAITS

@@ -16,6 +16,7 @@ KINDS = {
     "grid": partial(GRID, 6),
     "many": partial(GRID, 300),
     "stateful": partial(GRID, 6, expose_state=True),
+    "in codes": partial(GRID, 300, codes=True),
     "without instructions": partial(GRID, 6, instructed=False),
     "dials": partial(dials, 6),
     "dials with a stop": partial(dials, 6, stop=PRESS),

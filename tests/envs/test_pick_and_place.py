@@ -12,8 +12,9 @@ from envs.stepping import assert_same, scenes
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
+from ifo_grounding.mosaic import as_words, assemble
 from ifo_grounding.tasks import VOCABULARY
-from ifo_grounding.world import Layout, WorldState, render
+from ifo_grounding.world import Layout, WorldState, render, tile_table
 
 OBSERVED = {"pixels", "instruction", "done", "terminated", "truncated"}
 
@@ -175,6 +176,27 @@ def test_worlds_begin_as_they_are_arranged():
     first = learner.reset(TensorDict({"scene": torch.zeros(2, 1).long()}, [2]))
     again = TensorDict({"scene": torch.zeros(2, 1).long(), "state": state}, [2])
     assert torch.equal(learner.reset(again)["pixels"], first["pixels"])  # learners arrange nothing
+
+
+@pytest.mark.parametrize("tile_size", [8, 16])
+def test_codes_are_arbitrary_numbers_of_the_tiles_that_pixels_show(tile_size):
+    seen, coded = (
+        PickAndPlaceEnv("pick", 40, seed=0, tile_size=tile_size, codes=codes)
+        for codes in (False, True)
+    )
+    assert seen.tiles is None
+    shown = []
+    for env in (seen, coded):
+        torch.manual_seed(0)
+        shown.append(env.rollout(9, break_when_any_done=False)["pixels"])
+    frames, codes = shown
+    assert codes.dtype == torch.int16 and codes.shape == (40, 9, 6, 6)
+    assert torch.equal(assemble(as_words(coded.tiles), codes), frames)
+    # Two numbers never stand for one picture, nor do they say in which order the world counts.
+    assert len(coded.tiles.flatten(1).unique(dim=0)) == len(coded.tiles)
+    assert (coded.tiles != tile_table(tile_size)).flatten(1).any(1).float().mean() > 0.99
+    again = PickAndPlaceEnv("move", seed=1, tile_size=tile_size, codes=True)
+    assert torch.equal(again.tiles, coded.tiles)
 
 
 def test_who_steps_before_a_reset_is_told():

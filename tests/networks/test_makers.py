@@ -4,8 +4,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
-from ifo_grounding.networks import NetworkConfig, Shapes
+from ifo_grounding.mosaic import as_words, assemble
+from ifo_grounding.networks import NetworkConfig, Shapes, read_codes
 from networks.conftest import MAKERS, OUTPUTS, inputs, nested_keys, tiled
 
 SIZES = [
@@ -102,6 +104,36 @@ def outputs_and_gradients(module, kind, data):
     out, _ = run(kind, module, data)
     (out * torch.linspace(-1, 1, out.numel()).view_as(out)).sum().backward()
     return [out.detach(), *(parameter.grad.clone() for parameter in module.parameters())]
+
+
+@pytest.mark.parametrize("tile", [8, 16])
+def test_numbers_of_tiles_are_read_as_the_pixels_that_they_stand_for(kind, preset, shapes, tile):
+    module, data = MAKERS[kind](shapes, preset, seed=0), inputs(shapes, [40])
+    draw = torch.Generator().manual_seed(0)
+    tiles = torch.randint(256, (9, 3, tile, tile), generator=draw, dtype=torch.uint8)
+    coded = data.clone()
+    for key in ("pixels", "initial_pixels", ("next", "pixels")):
+        codes = torch.randint(9, (40, 48 // tile, 48 // tile), generator=draw, dtype=torch.int16)
+        coded[key], data[key] = codes, assemble(as_words(tiles), codes)
+    read_codes(module, tiles)
+    found = [outputs_and_gradients(module, kind, each) for each in (data, coded)]
+    torch.testing.assert_close(*found, atol=1e-5, rtol=1e-4)
+    shaped = coded.reshape(5, 8)
+    assert run(kind, module, shaped)[0].shape[:2] == (5, 8)
+    assert not any("tiles" in name for name in module.state_dict())
+
+
+def test_numbers_of_tiles_that_a_network_does_not_know_are_refused(kind, shapes):
+    env = PickAndPlaceEnv(num_envs=2, seed=0, codes=True)
+    module, data = MAKERS[kind](shapes, seed=0), inputs(shapes, [2])
+    data["initial_pixels"] = data["pixels"] = data["next", "pixels"] = env.reset()["pixels"]
+    with pytest.raises(UserError, match=r"got numbers of tiles: .*read_codes\(network, env.tiles"):
+        run(kind, module, data)
+    read_codes(module, env.tiles)
+    for key in ("pixels", "initial_pixels", ("next", "pixels")):
+        data[key] = data[key][:, 1:]
+    with pytest.raises(UserError, match="images of 48 x 48 pixels, got 5 x 6 tiles of 8"):
+        run(kind, module, data)
 
 
 def test_keys_can_be_nested(kind, shapes):

@@ -11,6 +11,7 @@ from ifo_grounding.config import STAGES
 from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
+from ifo_grounding.mosaic import as_words, assemble
 from ifo_grounding.report import results_rows, text_table
 from pretended_gpu import pretended_gpu
 from recipes.conftest import make_stages
@@ -191,6 +192,24 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
     assert fresh_states(given, 301) is None
     states = fresh_states(given, 300)
     assert len(states) == len(states.flatten(1).unique(dim=0)) == 301
+
+
+def test_the_own_world_is_learned_from_in_codes_of_one_simulator(options):
+    from _shared import coded_simulator, load_network, open_run, read_fast
+    from imitate import labelled_demonstrations
+
+    given = options("task=pick")
+    make_stages(given, until="imitate")
+    run, simulator = open_run(given), coded_simulator(given, 3)
+    policy = load_network(run, "policy-phase1.safetensors", "imitate", given)
+    seen, _ = labelled_demonstrations(run, 0.0)
+    pixels = seen[:]["pixels"]
+    expected = policy(seen[:])["logits"]
+    read_fast(seen, given)
+    codes = seen[:]["pixels"]
+    assert codes.dtype == simulator.reset()["pixels"].dtype == torch.int16
+    assert torch.equal(assemble(as_words(simulator.tiles), codes), pixels)
+    torch.testing.assert_close(policy(seen[:])["logits"], expected)
 
 
 def test_what_is_measured_otherwise_is_measured_anew(options, capsys, phase_1):

@@ -30,8 +30,9 @@ def test_pairs_are_distinct_scenes_with_suitable_instructions():
     assert (number != 9).all()
 
 
-def test_pairs_hold_the_scene_that_the_simulator_draws_again():
-    world = PickAndPlaceEnv("move", num_envs=16, seed=7, instructed=False)
+@pytest.mark.parametrize("codes", [False, True])
+def test_pairs_hold_the_scene_that_the_simulator_draws_again(codes):
+    world = PickAndPlaceEnv("move", num_envs=16, seed=7, instructed=False, codes=codes)
     sure = TensorDictModule(
         lambda pixels, instruction: 2.0 * (pixels.flatten(1).sum(1, keepdim=True) // 64 % 2) - 0.5,
         ["pixels", "instruction"],
@@ -39,7 +40,7 @@ def test_pairs_hold_the_scene_that_the_simulator_draws_again():
     )
     pairs = select_pairs(world, sure, torch.ones(2, 16).long(), 40)
     assert torch.cat([pairs["scene"][1:] - pairs["scene"][:-1]]).max() > 1  # some were passed over
-    fresh = PickAndPlaceEnv("move", num_envs=40, seed=7, instructed=False)
+    fresh = PickAndPlaceEnv("move", num_envs=40, seed=7, instructed=False, codes=codes)
     pixels = fresh.reset(pairs.select("scene"))["pixels"]
     assert torch.equal(frame_hash(pixels), pairs["frame_hash"][:, 0])
 

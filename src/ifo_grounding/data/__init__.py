@@ -3,7 +3,7 @@
 from ifo_grounding.data.babyai import babyai, bot_outcomes, record_babyai
 from ifo_grounding.data.buffers import first_frame_buffer, goal_buffer
 from ifo_grounding.data.codec import FrameCodec
-from ifo_grounding.data.decoding import FrameDecoder
+from ifo_grounding.data.decoding import FrameDecoder, show_codes
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.huggingface import from_huggingface, to_huggingface
 from ifo_grounding.data.labelling import (
@@ -43,6 +43,7 @@ __all__ = [
     "record_demonstrations",
     "save_lerobot",
     "save_pictures",
+    "show_codes",
     "to_huggingface",
     "to_minari",
 ]

@@ -169,6 +169,18 @@ class FrameCodec:
             return codes
         return mosaic.assemble(self.words.to(codes.device), codes)
 
+    def numbers_among(self, tiles: Tensor) -> Tensor | None:
+        """Return which of some tiles each of the dictionary is, int16 [K].
+
+        None where one is none of them, uint8 [N, C, T, T], or the codec is raw.
+        """
+        if self.words is None or tiles.shape[1:] != self.words.view(torch.uint8).shape[1:]:
+            return None
+        rows = enumerate(mosaic.as_words(tiles.cpu()).numpy())
+        known = {row.tobytes(): number for number, row in rows}
+        found = [known.get(tile, -1) for tile in self._numbers]  # in the order of their numbers
+        return None if -1 in found else torch.tensor(found, dtype=torch.int16)
+
     def check(self, codes: Tensor) -> None:
         """Refuse codes, [F, *code_shape], that this codec cannot have made."""
         raw = self.words is None

@@ -83,7 +83,37 @@ class FrameDecoder(Lookup):
         super().__init__(codec.words, in_keys, out_keys)
         self.codec = codec
 
+    def show_codes(self, tiles: Tensor) -> None:
+        """Give numbers of these tiles in place of pixels, see :func:`show_codes`."""
+        numbers = self.codec.numbers_among(tiles)
+        if numbers is not None:
+            self.table = numbers.to(self.table.device)
+
     def _apply_transform(self, codes: Tensor) -> Tensor:
         if self.table is None:
             return codes
+        if self.table.ndim == 1:
+            return super()._apply_transform(codes)
         return mosaic.assemble(self.table, codes.to(self.table.device))
+
+
+def show_codes(buffer: Any, tiles: Tensor) -> None:
+    """Let a buffer give, in place of pixels, which tile lies where, int16 [*B, h, w].
+
+    Networks read that faster (:func:`ifo_grounding.networks.read_codes`). Where frames are not made
+    of these tiles, pixels come as before.
+
+    Args:
+        buffer: a replay buffer of this package, such as :func:`labelled_buffer` returns.
+        tiles: ``env.tiles`` of an environment that shows codes, uint8 [K, C, T, T].
+
+    >>> from ifo_grounding.data import first_frame_buffer, record_demonstrations, show_codes
+    >>> from ifo_grounding.envs import PickAndPlaceEnv
+    >>> buffer = first_frame_buffer(record_demonstrations("move", 4, seed=0))
+    >>> show_codes(buffer, PickAndPlaceEnv(codes=True).tiles)
+    >>> buffer[:]["pixels"].shape
+    torch.Size([4, 6, 6])
+    """
+    for part in buffer.transform.modules():
+        if isinstance(part, FrameDecoder):
+            part.show_codes(tiles)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -43,10 +42,10 @@ class NumberedEnv(EnvBase):
         shape = (*self.batch_size, *shape)
         return Bounded(0, high, shape=shape, dtype=dtype, device=self.device)
 
-    def _declare(self, image_shape: Sequence[int], n_actions: int, **more: Composite) -> None:
+    def _declare(self, pixels: Bounded, n_actions: int, **more: Composite) -> None:
         on: Any = {"shape": self.batch_size, "device": self.device}
         observation = Composite(more, **on)
-        observation[keys.PIXELS] = self._bounded(255, *image_shape, dtype=torch.uint8)
+        observation[keys.PIXELS] = pixels
         if self.instructed:
             words = self._bounded(self.vocabulary_size - 1, self.instruction_length)
             observation[keys.INSTRUCTION] = words

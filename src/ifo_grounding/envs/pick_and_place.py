@@ -16,10 +16,11 @@ from ifo_grounding import keys
 from ifo_grounding.envs.base import DONE, NumberedEnv
 from ifo_grounding.envs.simulator import RENDER_TILE_SIZE, Simulator
 from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.seeding import generator
 from ifo_grounding.tasks.goals import MAX_STEPS
 from ifo_grounding.tasks.scenes import Scene, SceneOptions
 from ifo_grounding.tasks.vocabulary import VOCABULARY
-from ifo_grounding.world import N_BOXES, N_KINDS, Layout
+from ifo_grounding.world import N_BOXES, N_KINDS, Layout, tile_index, tile_table
 
 STATE = "state"
 
@@ -41,6 +42,9 @@ class PickAndPlaceEnv(NumberedEnv):
             instruction and no reward.
         expose_state: whether the true state is in the tensordict, for tools other than learners:
             adds ``("state", ...)`` entries.
+        codes: whether ``"pixels"`` holds, instead of the image, which tile lies where, int16
+            [*B, 6, 6]: arbitrary numbers of :attr:`tiles`. Networks that are built for this
+            environment read them (:func:`ifo_grounding.networks.read_codes`).
 
     The others are fields of :class:`~ifo_grounding.tasks.SceneOptions`.
 
@@ -73,6 +77,7 @@ class PickAndPlaceEnv(NumberedEnv):
         split: str = "all",
         instructed: bool = True,
         expose_state: bool = False,
+        codes: bool = False,
         *,
         holdout: str = "pairs-3",
         holdout_visible: bool = True,
@@ -97,8 +102,17 @@ class PickAndPlaceEnv(NumberedEnv):
         self._simulator = Simulator(options, num_envs, seed, tile_size, self.device)
         self._shown = [keys.PIXELS, keys.INSTRUCTION] if instructed else [keys.PIXELS]
         side = options.layout.size * tile_size
+        self.image_shape = (3, side, side)
         state = {STATE: self._state_spec()} if expose_state else {}
-        self._declare((3, side, side), keys.N_ACTIONS, **state)
+        self._number: Tensor | None = None
+        pixels = self._bounded(255, *self.image_shape, dtype=torch.uint8)
+        check_choice("codes", codes, (True, False))
+        if codes:
+            count, grid = len(tile_table(tile_size)), [options.layout.size] * 2
+            number = torch.randperm(count, generator=generator(0, "codes"))
+            self._number = number.to(self.device, torch.int16)
+            pixels = self._bounded(count - 1, *grid, dtype=torch.int16)
+        self._declare(pixels, keys.N_ACTIONS, **state)
 
     @property
     def options(self) -> SceneOptions:
@@ -125,6 +139,14 @@ class PickAndPlaceEnv(NumberedEnv):
         return self._simulator.numbers.clone()
 
     @property
+    def tiles(self) -> Tensor | None:
+        """What codes stand for, uint8 [1456, 3, T, T]; None where pixels are shown."""
+        if self._number is None:
+            return None
+        tiles = tile_table(self.tile_size).to(self.device)
+        return torch.empty_like(tiles).index_copy_(0, self._number.long(), tiles)
+
+    @property
     def truth(self) -> Scene:
         """The worlds as they are and what they are asked, [num_envs]; clone what is to be kept.
 
@@ -141,6 +163,7 @@ class PickAndPlaceEnv(NumberedEnv):
         """Move the worlds, with the episodes that run in them, to a device."""
         super().to(device)
         self._simulator.to(self.device)
+        self._number = None if self._number is None else self._number.to(self.device)
         return self
 
     def _state_spec(self) -> Composite:
@@ -208,12 +231,19 @@ class PickAndPlaceEnv(NumberedEnv):
 
     def _observe(self) -> TensorDict:
         result = TensorDict({}, batch_size=self.batch_size, device=self.device)
-        result[keys.PIXELS] = self._simulator.pixels()
+        result[keys.PIXELS] = self._look()
         if self.instructed:
             result[keys.INSTRUCTION] = self._simulator.instruction.clone()
         if self.expose_state:
             result[STATE] = self._simulator.state.to_tensordict()
         return result
+
+    def _look(self) -> Tensor:
+        """Return what is shown of the worlds, pixels or codes."""
+        if self._number is None:
+            return self._simulator.pixels()
+        index = tile_index(self._simulator.state)
+        return self._number.index_select(0, index.flatten().int()).view_as(index)
 
     def _set_seed(self, seed: int | None) -> None:
         self._simulator.seed(secrets.randbits(31) if seed is None else seed)

@@ -158,7 +158,7 @@ class GymnasiumEnv(NumberedEnv):
         self.stop_action = worlds.get_attr("stop")[0]  # type: ignore[attr-defined]
         """The action by which a policy ends an episode, or None."""
         pixels = worlds.single_observation_space[keys.PIXELS]  # type: ignore[index]
-        self._declare(pixels.shape, self.n_actions)
+        self._declare(self._bounded(255, *pixels.shape, dtype=torch.uint8), self.n_actions)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask, numbers = self._asked(tensordict)

@@ -11,6 +11,7 @@ eval mode, in which to collect and to evaluate; the supervised losses switch to 
 they compute.
 """
 
+from ifo_grounding.networks.base import read_codes
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.makers import (
     make_goal_classifier,
@@ -36,6 +37,7 @@ __all__ = [
     "make_policy",
     "make_reward_model",
     "make_value",
+    "read_codes",
     "save",
     "save_pretrained",
 ]

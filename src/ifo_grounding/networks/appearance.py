@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ifo_grounding.networks.patches import as_float, cells_of
+from ifo_grounding.networks.patches import Mosaics, as_float, cells_of
 
 EVIDENCE = 16
 """Size of what a word is compared with."""
@@ -49,8 +49,8 @@ class ColourAndForm(nn.Module):
         self.form = nn.Linear(features, EVIDENCE)
         self.silhouette = nn.Linear(edges, features)
 
-    def forward(self, image: Tensor) -> Appearance:
-        """See an image [N, C, H, W], its distinct cells once."""
+    def forward(self, image: Tensor | Mosaics) -> Appearance:
+        """See images [N, C, H, W], their distinct cells once."""
         tiles, where = cells_of(image, self.patch)
         tiles = as_float(tiles, self.colour.weight)
         pixels = tiles.transpose(1, 2)  # [U, P * P, C]

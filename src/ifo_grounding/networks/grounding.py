@@ -19,6 +19,7 @@ from ifo_grounding.networks.appearance import EVIDENCE, Appearance, ColourAndFor
 from ifo_grounding.networks.cells import cell_places, look_up
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.layers import convolutions
+from ifo_grounding.networks.patches import Mosaics
 from ifo_grounding.networks.sentences import rows_of_ids, without_padding
 from ifo_grounding.networks.shapes import Shapes, grid_of, patch_size
 
@@ -93,7 +94,7 @@ class WordMaps(nn.Module):
             said[tokens] = True
             said[0] = False
             if used is None:
-                spreads = _spread(colour) + _spread(form)
+                spreads = _spread(colour, seen.where) + _spread(form, seen.where)
                 self.word_penalty = torch.where(said, spreads, 0).sum()
             else:
                 colours, forms = colour[:, said[used]], form[:, said[used]]
@@ -195,7 +196,7 @@ class GroundedTrunk(nn.Module):
         self.grid = grid_of(shapes, config)
         self.register_buffer("place", cell_places(self.grid), persistent=False)
 
-    def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
+    def forward(self, image: Tensor | Mosaics, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
         cells = self.appearance(image)
         tokens = without_padding(rows_of_ids(tokens), self.words.role.num_embeddings)
@@ -219,7 +220,7 @@ class GroundedTrunk(nn.Module):
             known.append((bearing.unsqueeze(-1) * places.unsqueeze(1)).flatten(1))
         return torch.cat(known, -1)
 
-    def maps(self, image: Tensor, tokens: Tensor) -> Tensor:
+    def maps(self, image: Tensor | Mosaics, tokens: Tensor) -> Tensor:
         """Return how each map weighs the cells of an image: [N, 2 * maps, h * w]."""
         logits, _ = self.words(self.appearance(image), tokens.long())
         return weigh(logits)
@@ -244,6 +245,14 @@ def surroundings(layers: nn.Module, shown: Tensor, grid: tuple[int, int]) -> Ten
     return around.flatten(2).transpose(1, 2)
 
 
-def _spread(evidence: Tensor) -> Tensor:
-    """Return the standard deviation over cells of [U, V], for each word [V]."""
-    return evidence.var(0, unbiased=False).add(1e-4).sqrt()
+def _spread(evidence: Tensor, where: Tensor | None = None) -> Tensor:
+    """Return the standard deviation of [U, V] over the cells that there are, for each word [V].
+
+    Those are all, or the ones that lie somewhere: ``where``, int64 [N, h * w].
+    """
+    if where is None:
+        return evidence.var(0, unbiased=False).add(1e-4).sqrt()
+    there = evidence.new_zeros(len(evidence), 1).index_fill(0, where.flatten(), 1)
+    there = there / there.sum()
+    off = evidence - (there * evidence).sum(0)
+    return (there * off**2).sum(0).add(1e-4).sqrt()

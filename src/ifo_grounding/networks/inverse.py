@@ -13,6 +13,7 @@ from ifo_grounding.networks.cells import distinct_pairs
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
 from ifo_grounding.networks.layers import ResidualBlock, flatten_cells, head, pool_cells
+from ifo_grounding.networks.patches import Mosaics, as_pixels
 from ifo_grounding.networks.shapes import Shapes, patch_size
 
 
@@ -42,8 +43,19 @@ class InverseNetwork(ImageNetwork):
         before, batch = self.flat_pixels(pixels)
         after, next_batch = self.flat_pixels(next_pixels)
         same_batch(pixels=batch, next_pixels=next_batch)
-        outputs = self._logits(self.image(torch.cat([before, after], -3)))
+        if isinstance(before, Mosaics) and isinstance(after, Mosaics) and self._looks_up:
+            outputs = self.from_tiles(before.tiles, before.codes, after.codes)
+        else:
+            both = torch.cat([as_pixels(before), as_pixels(after)], -3)
+            outputs = self._logits(self.image(both))
         return outputs.float().reshape(*batch, outputs.shape[-1])
+
+    @property
+    def _looks_up(self) -> bool:
+        """Whether codes are read by :meth:`from_tiles`, which a GPU would have to be waited for."""
+        if self.tiles is None or self.tiles.is_cuda:
+            return False
+        return self.reads_tiles(self.shapes.image_shape, self.tiles.shape[-1])
 
     def reads_tiles(self, image_shape: tuple[int, ...], tile_size: int | None) -> bool:
         """Whether :meth:`from_tiles` takes images of this shape made of tiles of this size."""

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torch.distributions import Categorical
 from torchrl.data import Categorical as CategoricalSpec
 from torchrl.modules import ProbabilisticActor, ValueOperator
@@ -18,6 +18,7 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from ifo_grounding import keys, seeding
 from ifo_grounding.attributes import attribute
 from ifo_grounding.errors import UserError
+from ifo_grounding.networks.base import read_codes
 from ifo_grounding.networks.config import INPUTS, NetworkConfig
 from ifo_grounding.networks.inverse import InverseNetwork
 from ifo_grounding.networks.scoring import GatedScorer, PairScorer
@@ -74,6 +75,8 @@ def build(
     built = built.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     module = wrap(built, options["in_keys"], [options.get("out_key")])
     module.network_config = Blueprint(kind, shapes, config, options)
+    if isinstance(tiles := attribute(source, "tiles"), Tensor):
+        read_codes(module, tiles)
     words = attribute(source, "vocabulary")
     module.vocabulary = words if shapes.fit(words) else None
     return module.eval()

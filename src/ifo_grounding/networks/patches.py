@@ -13,7 +13,7 @@ from torch import Tensor
 from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
 from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
-from ifo_grounding.mosaic import as_words
+from ifo_grounding.mosaic import as_words, assemble
 
 FEWEST_WINDOWS = 1 << 12
 """Fewer windows than that are computed as fast as they are compared."""
@@ -82,8 +82,7 @@ def as_float(pixels: Tensor, weight: Tensor) -> Tensor:
     return pixels.to(weight.dtype)
 
 
-@remembered
-def cells_of(image: Tensor, patch: int) -> tuple[Tensor, Tensor]:
+def cells_of(image: Tensor | Mosaics, patch: int) -> tuple[Tensor, Tensor]:
     """Cut images [N, C, H, W] into cells, those that look alike once where that pays.
 
     It pays on a CPU, for bytes of which half or more repeat. Images whose sides are not multiples
@@ -96,6 +95,13 @@ def cells_of(image: Tensor, patch: int) -> tuple[Tensor, Tensor]:
     >>> cells.shape, where.shape
     (torch.Size([1, 3, 64]), torch.Size([2, 12]))
     """
+    if isinstance(image, Mosaics) and image.tiles.shape[-1] == patch:
+        return image.cells()
+    return _remembered_cells(as_pixels(image), patch)
+
+
+def _distinct_cells(image: Tensor, patch: int) -> tuple[Tensor, Tensor]:
+    """Find what :func:`cells_of` returns."""
     below, right = (-size % patch for size in image.shape[-2:])
     image = F.pad(image, (0, right, 0, below)) if below or right else image
     if is_plain(image) and not patch % WORD:
@@ -110,10 +116,41 @@ def cells_of(image: Tensor, patch: int) -> tuple[Tensor, Tensor]:
     return cells, index.view(cut.shape[:3]).flatten(1)
 
 
+_remembered_cells = remembered(_distinct_cells)
+
+
 def _cut(image: Tensor, height: int, width: int) -> Tensor:
     """Cut [N, C, H, W] into [N, h, w, C * height * width]."""
     cells = image.unflatten(-1, (-1, width)).unflatten(-3, (-1, height))
     return cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
+
+
+class Mosaics(NamedTuple):
+    """Images by the tiles that they are made of."""
+
+    tiles: Tensor
+    """uint8 [K, C, T, T]."""
+    codes: Tensor
+    """Which tile lies where, integer [N, h, w]."""
+
+    def cells(self) -> tuple[Tensor, Tensor]:
+        """Return what :func:`cells_of` does of the pixels, where a tile is a cell.
+
+        On a GPU, which would have to be waited for to know which tiles are shown, those are all.
+        """
+        where = self.codes.flatten(1).long()
+        if where.device.type != "cpu":
+            return self.tiles.flatten(2), where
+        marks = torch.zeros(len(self.tiles), dtype=torch.int64)
+        marks[where.flatten()] = 1
+        shown = marks.nonzero().squeeze(1)
+        marks[shown] = torch.arange(len(shown))
+        return self.tiles[shown].flatten(2), marks[where]
+
+
+def as_pixels(image: Tensor | Mosaics) -> Tensor:
+    """Return images as pixels, [N, C, H, W]."""
+    return assemble(as_words(image.tiles), image.codes) if isinstance(image, Mosaics) else image
 
 
 class Windows(NamedTuple):
@@ -146,7 +183,7 @@ def distinct_windows(image: Tensor) -> Windows | None:
     few = 4 * len(image) * height * width < FEWEST_WINDOWS
     if few or not is_plain(image) or any(side % WORD for side in image.shape[-2:]):
         return None
-    cells, where = cells_of.__wrapped__(image, WORD)  # type: ignore[attr-defined]
+    cells, where = _distinct_cells(image, WORD)
     if 2 * len(cells) > where.numel() or len(cells) > MOST_TILES:
         return None
     tiles = cells.view(torch.int64)  # [U, C, 8], each number a row of pixels

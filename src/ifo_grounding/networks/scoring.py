@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ifo_grounding.networks.base import ImageNetwork, same_batch
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.layers import head
+from ifo_grounding.networks.patches import as_pixels
 from ifo_grounding.networks.shapes import Shapes
 from ifo_grounding.networks.trunk import GatedTrunk
 
@@ -104,7 +105,7 @@ class PairScorer(ImageNetwork):
         """Score images, each [*B, C, H, W], with token ids [*B, L], the last input: [*B, 1]."""
         *pixels, instruction = inputs
         batch = instruction.shape[:-1]
-        images = {f"image {number}": image.shape[:-3] for number, image in enumerate(pixels)}
+        images = {f"image {number}": self.batch_of(image) for number, image in enumerate(pixels)}
         same_batch(**images, instruction=batch)
         words = self.encode_instruction(instruction.reshape(-1, instruction.shape[-1]))
         own = torch.arange(len(words), device=words.device).unsqueeze(1)
@@ -121,7 +122,7 @@ class GatedScorer(PairScorer):
 
     def encode_scenes(self, *pixels: Tensor) -> Tensor:
         """Map images, each [*B, C, H, W], to features [N, F, h, w]."""
-        images = [self.flat_pixels(image)[0] for image in pixels]
+        images = [as_pixels(self.flat_pixels(image)[0]) for image in pixels]
         features: Tensor = self.trunk.image(torch.cat(images, -3))
         return features
 

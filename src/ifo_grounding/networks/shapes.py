@@ -124,7 +124,7 @@ def _from_specs(
         return
     leaves = observations.keys(True, True)
     batch: list[int] | None = None
-    if pixels in leaves:
+    if pixels in leaves and declared["image_shape"] is None:
         *batch, channels, height, width = observations[pixels].shape
         yield "image_shape", (channels, height, width)
     if instruction in leaves:

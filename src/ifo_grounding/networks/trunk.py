@@ -13,6 +13,7 @@ from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import ConvEncoder
 from ifo_grounding.networks.grounding import GroundedTrunk
 from ifo_grounding.networks.layers import GatedAttention, flatten_cells, head
+from ifo_grounding.networks.patches import Mosaics, as_pixels
 from ifo_grounding.networks.sentences import GRUInstructionEncoder
 from ifo_grounding.networks.shapes import Shapes, grid_of
 
@@ -34,16 +35,16 @@ class GatedTrunk(nn.Module):
         self.fusion = GatedAttention(self.instruction.size, config.features, config.sentence_rate)
         self.size = config.features * math.prod(grid_of(shapes, config))
 
-    def fuse(self, image: Tensor, tokens: Tensor) -> Tensor:
+    def fuse(self, image: Tensor | Mosaics, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to fused features [N, F, h, w]."""
-        return F.relu(self.fusion(self.image(image), self.instruction(tokens)))
+        return F.relu(self.fusion(self.image(as_pixels(image)), self.instruction(tokens)))
 
-    def maps(self, image: Tensor, tokens: Tensor) -> Tensor:
+    def maps(self, image: Tensor | Mosaics, tokens: Tensor) -> Tensor:
         """Return what all gates together let through of each cell of an image: [N, 1, h * w]."""
         let_through = self.fuse(image, tokens).sum(1, keepdim=True).flatten(2)
         return let_through / let_through.sum(-1, keepdim=True).clamp_min(1e-9)
 
-    def forward(self, image: Tensor, tokens: Tensor) -> Tensor:
+    def forward(self, image: Tensor | Mosaics, tokens: Tensor) -> Tensor:
         """Map an image [N, C, H, W] and token ids [N, L] to [N, size]."""
         return flatten_cells(self.fuse(image, tokens))
 

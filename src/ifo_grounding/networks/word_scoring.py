@@ -15,6 +15,7 @@ from ifo_grounding.networks.cells import Kinds, cell_places, group_cells, look_u
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.grounding import AROUND, FORMS, MODIFIER, WordMaps, surroundings
 from ifo_grounding.networks.layers import head
+from ifo_grounding.networks.patches import Mosaics
 from ifo_grounding.networks.scoring import PairScorer
 from ifo_grounding.networks.sentences import rows_of_ids, without_padding
 from ifo_grounding.networks.shapes import Shapes, patch_size
@@ -67,7 +68,7 @@ class WordScorer(PairScorer):
         seen = config.heads * (2 + config.values + 2 * maps)
         self.head = head(seen + 2 * maps * (3 + AROUND) + 2 * maps + MODIFIER, config, 1)
 
-    def _tables(self, images: list[Tensor]) -> list[Seen]:
+    def _tables(self, images: list[Tensor | Mosaics]) -> list[Seen]:
         """See the distinct cells of each image."""
         heads = (self.attention, self.value, self.form)
         weight = torch.cat([part.weight for part in heads])

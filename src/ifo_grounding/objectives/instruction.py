@@ -39,9 +39,9 @@ class InstructionLoss(SupervisedLoss):
         unlabelled: what is done about false negatives. ``"removal"`` drops the negatives scored
             highest; ``"mixture"`` drops none: :meth:`calibrate` then counts how many suitable ones
             they hold (Elkan and Noto 2008).
-        states: images of fresh states of the simulator, uint8 [S, C, H, W], from which each
-            demonstration's scene is told apart, too, given its own instruction: for few
-            demonstrations, whose scenes are soon known by heart. An extension.
+        states: images of fresh states of the simulator, uint8 [S, C, H, W], or their codes, int16
+            [S, h, w], from which each demonstration's scene is told apart, too, given its own
+            instruction: for few demonstrations, whose scenes are soon known by heart. An extension.
         fresh: how many of these, drawn anew for each batch, every instruction of it is scored with.
         swap_words: whether training swaps words for others where the network reads word by word
             (``"strong"``): for combinations that no demonstration names. It takes many
@@ -87,8 +87,11 @@ class InstructionLoss(SupervisedLoss):
         super().__init__(network)
         if contrast < 0:
             raise UserError(f"contrast is a weight of at least 0, got {contrast}")
-        if states is not None and (states.ndim != 4 or not len(states)):
-            raise UserError(f"states must be images [S, C, H, W], got shape {list(states.shape)}")
+        if states is not None:
+            coded = states.dtype == torch.int16 and states.ndim == 3
+            if (not coded and states.ndim != 4) or not len(states):
+                shape = list(states.shape)
+                raise UserError(f"states must be images [S, C, H, W], got shape {shape}")
         check_choice("treatment of unlabelled pairs", unlabelled, UNLABELLED)
         self.contrast, self.unlabelled = contrast, unlabelled
         self.negatives = NegativeInstructions(pool, removal_rate, warmup, near)

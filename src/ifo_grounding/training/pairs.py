@@ -76,7 +76,7 @@ def select_pairs(
     best_score = 0.0
     with progress_bar(total=n, desc="pairs", shown=progress) as bar:
         while count < n:
-            pixels = env.reset()[PIXELS].flatten(0, -4)
+            pixels = env.reset()[PIXELS].flatten(0, env.batch_dims - 1)
             choices = scorer.choose(pixels, generator=source, **options)
             rows = (choices.chosen >= 0).nonzero().squeeze(-1)[: n - count]
             seen, count, resets = seen + len(pixels), count + len(rows), resets + 1

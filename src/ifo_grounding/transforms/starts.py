@@ -146,14 +146,15 @@ class StartingPairs(InstructionTransform):
 
 
 def frame_hash(pixels: Tensor) -> Tensor:
-    """Return a number for each image that tells images apart, int64 [B].
+    """Return a number for each image, or for the codes of one, that tells images apart, int64 [B].
 
     >>> frames = torch.zeros(2, 3, 8, 8, dtype=torch.uint8)
     >>> frames[1, 0, 0, 0] = 1
     >>> frame_hash(frames).unique().numel()
     2
     """
-    flat = pixels.flatten(1).to(torch.uint8)
+    flat = pixels.flatten(1)
+    flat = flat.to(torch.uint8) if flat.is_floating_point() else flat.contiguous().view(torch.uint8)
     words = as_words(torch.nn.functional.pad(flat, (0, -flat.shape[1] % PIXELS_PER_WORD)))
     # Odd multipliers keep every bit; int64 arithmetic wraps around, the same on any device.
     place = torch.arange(words.shape[1], device=words.device) * 2 + 1

@@ -64,6 +64,14 @@ class World(ABC):
         The environment has the batch size [num_envs] and shows ``pixels``, uint8 [*B, C, H, W].
         """
 
+    def coded(self, num_envs: int, **options: Any) -> EnvBase:
+        """Return the simulator in which to practise: as it is, unless pixels can be left out.
+
+        One that shows numbers of tiles in their place declares ``tiles``, which networks then read
+        (:func:`ifo_grounding.networks.read_codes`).
+        """
+        return self.simulator(num_envs, **options)
+
     @abstractmethod
     def instructed(
         self,

@@ -65,6 +65,10 @@ class Grid(World):
         """Return worlds without instructions and true rewards; see :class:`World`."""
         return PickAndPlaceEnv(self.task, num_envs, instructed=False, **self.scenes(**options))
 
+    def coded(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
+        """Return the same, with numbers of tiles in place of pixels."""
+        return self.simulator(num_envs, codes=True, **options)
+
     def instructed(
         self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
     ) -> PickAndPlaceEnv:
@@ -127,6 +131,10 @@ class OpenGrid(World):
     def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions; see :class:`World`."""
         return Grid("move").simulator(num_envs, **options)
+
+    def coded(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
+        """Return the same, with numbers of tiles in place of pixels."""
+        return self.simulator(num_envs, codes=True, **options)
 
     def instructed(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds to play in, whose instructions and rewards are those of another task."""
