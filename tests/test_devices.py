@@ -12,6 +12,7 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.objectives import GoalLoss, ImitationLoss, InstructionLoss, InverseLoss
 from ifo_grounding.training.updates import total_loss
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
+from ifo_grounding.transforms.choosing import PoolScorer
 from pretended_gpu import pretended_gpu
 
 
@@ -155,6 +156,21 @@ def test_a_step_of_imitation_asks_a_gpu_nothing(preset, codes):
             total_loss(loss(batch.to("cuda"))).backward()
     assert "mm" in asking.noted or "addmm" in asking.noted
     assert not asking.noted & WAITS
+
+
+def test_a_gpu_is_asked_once_whether_the_weights_of_a_classifier_changed():
+    pool = data.record_demonstrations("pick", 20, seed=0).pool()
+    with pretended_gpu():
+        env = PickAndPlaceEnv("pick", num_envs=4, seed=0, device="cuda", codes=True)
+        classifier = networks.make_instruction_classifier(env, device="cuda", seed=0)
+        scorer = PoolScorer(classifier, pool)
+        with torch.no_grad():
+            before = scorer.words(torch.device("cuda", 0))
+            with Asking() as asking:
+                assert scorer.words(torch.device("cuda", 0)) is before
+            assert "equal" not in asking.noted
+            next(classifier.parameters()).data[0] += 1
+            assert scorer.words(torch.device("cuda", 0)) is not before
 
 
 @pytest.mark.parametrize("codes", [False, True])

@@ -105,10 +105,7 @@ class PoolScorer:
         weights = [*self.classifier.parameters(), *self.classifier.buffers()]
         # Values are compared, not version counters: updates through `.data` or from another
         # process do not count.
-        fresh = len(weights) == len(self._weights) and all(
-            now.device == kept.device and torch.equal(now, kept)
-            for now, kept in zip(weights, self._weights, strict=True)
-        )
+        fresh = equal(weights, self._weights)
         if self._encodings is None or not fresh or self._encodings.device != device:
             self._weights = [weight.detach().clone() for weight in weights]
             chunks = self.pool.to(device).split(AT_ONCE)
@@ -178,6 +175,16 @@ class PoolScorer:
 
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "_encodings": None, "_weights": []}  # a copy makes its own
+
+
+def equal(some: list[Tensor], others: list[Tensor]) -> bool:
+    """Whether tensors lie in the same places and hold the same values; a GPU is asked once."""
+    pairs = list(zip(some, others, strict=False))
+    if len(some) != len(others) or any(one.device != other.device for one, other in pairs):
+        return False
+    if all(one.device.type == "cpu" for one in some):
+        return all(torch.equal(one, other) for one, other in pairs)
+    return bool(torch.stack([(one == other).all() for one, other in pairs]).all())
 
 
 def check_options(threshold: float, candidates: int, choose: str) -> None:
