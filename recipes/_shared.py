@@ -17,7 +17,6 @@ from torchrl import torchrl_logger
 
 from ifo_grounding import networks
 from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
-from ifo_grounding.attributes import attribute
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport, show_codes
@@ -218,7 +217,7 @@ def read_fast(buffer: Any, options: Options) -> None:
     """Let a buffer give codes of the simulator's, where it has them, and keep frames on a GPU."""
     if getattr(buffer, "transform", None) is None:
         return
-    if (tiles := attribute(coded_simulator(options), "tiles")) is not None:
+    if (tiles := world_of(options).tiles) is not None:
         show_codes(buffer, tiles)
     parts = [part for part in buffer.transform.modules() if isinstance(part, FrameDecoder)]
     gpu = torch.device(options.device).type != "cpu"
@@ -240,7 +239,7 @@ def load_network(run: Run, name: str, recipe: str, options: Options) -> TensorDi
     """Load a network that an earlier recipe trained; another run's is refused."""
     path, checksum = run.need(name, recipe), checksums(run).get(name)
     network = networks.load(path, device=options.device, checksum=checksum)
-    if (tiles := attribute(coded_simulator(options), "tiles")) is not None:
+    if (tiles := world_of(options).tiles) is not None:
         networks.read_codes(network, tiles)
     return network
 

@@ -49,6 +49,8 @@ class World(ABC):
         oracle: what knows the truth; None where nobody does.
         judged: whether instructed worlds pay success. Without, nothing is evaluated: a person looks
             at what was learned (``ifo-grounding play``).
+        tiles: what the numbers that :meth:`coded` shows stand for, uint8 [K, C, T, T], which
+            networks then read (:func:`ifo_grounding.networks.read_codes`); None for pixels.
     """
 
     actions: Sequence[str] = ()
@@ -56,6 +58,7 @@ class World(ABC):
     vocabulary: Vocabulary | None = None
     oracle: Oracle | None = None
     judged: bool = True
+    tiles: Tensor | None = None
 
     @abstractmethod
     def simulator(self, num_envs: int, *, seed: int, device: str = "cpu") -> EnvBase:
@@ -67,8 +70,7 @@ class World(ABC):
     def coded(self, num_envs: int, **options: Any) -> EnvBase:
         """Return the simulator in which to practise: as it is, unless pixels can be left out.
 
-        One that shows numbers of tiles in their place declares ``tiles``, which networks then read
-        (:func:`ifo_grounding.networks.read_codes`).
+        A world that has ``tiles`` shows their numbers in place of pixels.
         """
         return self.simulator(num_envs, **options)
 

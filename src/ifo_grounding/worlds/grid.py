@@ -69,6 +69,11 @@ class Grid(World):
         """Return the same, with numbers of tiles in place of pixels."""
         return self.simulator(num_envs, codes=True, **options)
 
+    @property
+    def tiles(self) -> Tensor | None:  # type: ignore[override]
+        """What the numbers that :meth:`coded` shows stand for."""
+        return self.coded(1, seed=0).tiles
+
     def instructed(
         self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
     ) -> PickAndPlaceEnv:
@@ -135,6 +140,11 @@ class OpenGrid(World):
     def coded(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return the same, with numbers of tiles in place of pixels."""
         return self.simulator(num_envs, codes=True, **options)
+
+    @property
+    def tiles(self) -> Tensor | None:  # type: ignore[override]
+        """What the numbers that :meth:`coded` shows stand for."""
+        return self.coded(1, seed=0).tiles
 
     def instructed(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds to play in, whose instructions and rewards are those of another task."""
