@@ -69,7 +69,7 @@ def expected_minutes(options: Options) -> float:
     seconds += scored * (1 + told.negatives + fresh) * 1e-5
     seconds += goal.steps * goal.batch_size * (1 + goal.negatives) * 4e-5
     practised = options.self_examine
-    seconds += practised.iterations * practised.num_envs * practised.steps * 5e-4
+    seconds += practised.iterations * practised.num_envs * practised.steps * 3e-4
     seconds += options.evaluate.episodes * 8e-3
     return (20 + seconds * (4 if options.preset == "paper" else 1)) / 60
 
