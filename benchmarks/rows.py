@@ -221,7 +221,7 @@ def many_worlds(batch: int, drawn: bool) -> Row:
         f"step, reset{' and pixels' if drawn else ''}, batch {batch:,}",
         "steps/s",
         contenders,
-        {"rate": 10e6 if drawn else 100e6},
+        {"rate": 10e6 if drawn else 100e6} if on_gpu() else {},
         "a random policy, which ends every sixth episode at each step; new scenes are drawn on the "
         "way; on a GPU a step with its reset is one CUDA graph",
     )
