@@ -14,6 +14,7 @@ from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.errors import UserError
 from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
 from ifo_grounding.mosaic import as_words, assemble
+from ifo_grounding.networks.cells import distinct_pairs
 
 FEWEST_WINDOWS = 1 << 12
 """Fewer windows than that are computed as fast as they are compared."""
@@ -141,11 +142,8 @@ class Mosaics(NamedTuple):
         where = self.codes.flatten(1).long()
         if where.device.type != "cpu":
             return self.tiles.flatten(2), where
-        marks = torch.zeros(len(self.tiles), dtype=torch.int64)
-        marks[where.flatten()] = 1
-        shown = marks.nonzero().squeeze(1)
-        marks[shown] = torch.arange(len(shown))
-        return self.tiles[shown].flatten(2), marks[where]
+        shown, _, index = distinct_pairs(where, where.new_zeros(()), len(self.tiles), 1)
+        return self.tiles[shown].flatten(2), index
 
 
 def as_pixels(image: Tensor | Mosaics) -> Tensor:

@@ -21,7 +21,7 @@ from ifo_grounding.networks.trunk import GatedTrunk
 SUREST = 0.98
 """The most that an estimate of densities alone lets one believe."""
 PAIRS_AT_ONCE = 1 << 11
-"""Pairs of a scene and an instruction that are scored together, to bound memory."""
+"""Pairs of a scene and an instruction that are scored together: they fit a core's cache."""
 
 
 class PairScorer(ImageNetwork):

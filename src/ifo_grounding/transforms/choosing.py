@@ -179,12 +179,13 @@ class PoolScorer:
 
 def equal(some: list[Tensor], others: list[Tensor]) -> bool:
     """Whether tensors lie in the same places and hold the same values; a GPU is asked once."""
-    pairs = list(zip(some, others, strict=False))
-    if len(some) != len(others) or any(one.device != other.device for one, other in pairs):
+    places = [[(each.device, each.shape) for each in tensors] for tensors in (some, others)]
+    if places[0] != places[1]:
         return False
     if all(one.device.type == "cpu" for one in some):
-        return all(torch.equal(one, other) for one, other in pairs)
-    return bool(torch.stack([(one == other).all() for one, other in pairs]).all())
+        return all(map(torch.equal, some, others))
+    same = [(one == other).all() for one, other in zip(some, others, strict=True)]
+    return bool(torch.stack(same).all())
 
 
 def check_options(threshold: float, candidates: int, choose: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,25 @@ from ifo_grounding.world import Layout
 from ifo_grounding.worlds.base import World
 
 
+class Tiled(World):
+    """A world of which the simulator can show numbers of tiles in place of pixels."""
+
+    @abstractmethod
+    def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
+        """Return worlds without instructions and true rewards; see :class:`World`."""
+
+    def coded(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
+        """Return the simulator in codes; see :class:`World`."""
+        return self.simulator(num_envs, codes=True, **options)
+
+    @property
+    def tiles(self) -> Tensor | None:  # type: ignore[override]
+        """What the numbers that :meth:`coded` shows stand for."""
+        return self.coded(1, seed=0).tiles
+
+
 @dataclass
-class Grid(World):
+class Grid(Tiled):
     """Pick and place on a grid of 6x6 cells; its oracle knows what suits a scene.
 
     >>> Grid("pick").simulator(4, seed=0).batch_size
@@ -64,15 +82,6 @@ class Grid(World):
     def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions and true rewards; see :class:`World`."""
         return PickAndPlaceEnv(self.task, num_envs, instructed=False, **self.scenes(**options))
-
-    def coded(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
-        """Return the same, with numbers of tiles in place of pixels."""
-        return self.simulator(num_envs, codes=True, **options)
-
-    @property
-    def tiles(self) -> Tensor | None:  # type: ignore[override]
-        """What the numbers that :meth:`coded` shows stand for."""
-        return self.coded(1, seed=0).tiles
 
     def instructed(
         self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
@@ -125,7 +134,7 @@ class Grid(World):
 
 
 @dataclass
-class OpenGrid(World):
+class OpenGrid(Tiled):
     """The same grid with sentences of a person's own, of which nobody knows what fulfils them."""
 
     judged = False
@@ -136,15 +145,6 @@ class OpenGrid(World):
     def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions; see :class:`World`."""
         return Grid("move").simulator(num_envs, **options)
-
-    def coded(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
-        """Return the same, with numbers of tiles in place of pixels."""
-        return self.simulator(num_envs, codes=True, **options)
-
-    @property
-    def tiles(self) -> Tensor | None:  # type: ignore[override]
-        """What the numbers that :meth:`coded` shows stand for."""
-        return self.coded(1, seed=0).tiles
 
     def instructed(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds to play in, whose instructions and rewards are those of another task."""
