@@ -47,8 +47,6 @@ class Row:
     note: str = ""
     facts: dict[str, float] = field(default_factory=dict)
     """What else was found, such as megabytes."""
-    curves: dict[str, dict[int, float]] = field(default_factory=dict)
-    """Seconds by size, for each thing that was grown."""
     peers: list[Peer] = field(default_factory=list)
 
     def measure(self, repeats: int) -> dict[str, Any]:
@@ -75,10 +73,6 @@ class Row:
             "reach": self.reach,
             "peak_mb": memory,
             "facts": self.facts,
-            "curves": {
-                name: {str(size): float(f"{seconds:.4g}") for size, seconds in curve.items()}
-                for name, curve in self.curves.items()
-            },
             "note": self.note,
         }
 
@@ -98,17 +92,6 @@ def resident_memory() -> float:
     """Return how much memory this process holds now, in MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
-
-
-def median_time(work: Callable[[], object], repeats: int) -> float:
-    """Return the median time of some repeats, after one that does not count, in seconds."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 class Peer:

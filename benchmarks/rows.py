@@ -8,14 +8,13 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import torch
-from measuring import ROOT, Once, Peer, Row, median_time, peak_memory, resident_memory, timed
+from measuring import ROOT, Once, Peer, Row, peak_memory, resident_memory, timed
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
@@ -39,7 +38,6 @@ from ifo_grounding.training import FitConfig, fit
 from ifo_grounding.transforms import InstructionSampler
 from ifo_grounding.world import (
     Canvas,
-    Layout,
     WorldState,
     random_layout,
     render,
@@ -497,40 +495,6 @@ def whole() -> Row:
     )
 
 
-def growth() -> Row:
-    def play(batch: int, size: int) -> Callable[[], object]:
-        state = random_layout(Lots(0, torch.arange(batch, device=DEVICE)), Layout(size=size))
-        action = torch.randint(6, (batch,), device=DEVICE)
-
-        def work() -> None:
-            render(step(state, action))
-            finish()
-
-        return work
-
-    batches = [4**power for power in range(9)]
-    counts = [1000, 10_000, 100_000, 1_000_000]
-
-    def record(count: int) -> float:
-        start = time.perf_counter()
-        record_demonstrations("move", count, seed=0)
-        return time.perf_counter() - start
-
-    record(1000)
-    return Row(
-        "growth",
-        "s",
-        {},
-        curves={
-            "step and pixels, by batch": {n: median_time(play(n, 6), 5) for n in batches},
-            "step and pixels of 1,024, by cells": {
-                n * n: median_time(play(1024, n), 5) for n in range(6, 11)
-            },
-            "recording, by demonstrations of move": {n: record(n) for n in counts},
-        },
-    )
-
-
 def some_sentences(task: str, count: int) -> torch.Tensor:
     """Return token ids of different sentences of a task, [count, 16]."""
     demos = record_demonstrations(task, 3 * count, seed=0)
@@ -557,7 +521,6 @@ ROWS: dict[str, Callable[[], Row]] = {
     "memory": memory,
     "streaming": streaming,
     "whole": whole,
-    "growth": growth,
 }
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Speed of every part, beside what else does the same: ``python benchmarks/run.py [row ...]``.
 
 Each row runs in a process of its own on the same cores; contenders of a row take turns. Writes a
-results file; ``python docs/make_speed.py`` makes the page of it.
+results file; ``python docs/make_results.py`` makes the page of it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def measure_apart(name: str, options: argparse.Namespace) -> dict:
 def shown(row: dict) -> list[dict]:
     """Return the lines of a table about a row."""
     if not row["rates"]:
-        found = {**row["facts"], **row["curves"]}
+        found = row["facts"]
         return [{"row": row["name"], "what": name, "found": str(found[name])} for name in found]
     ours = next(iter(row["rates"]))
     return [

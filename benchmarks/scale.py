@@ -1,6 +1,6 @@
 """Ray and torchrun beside one process: ``python benchmarks/scale.py [row ...]``, on two idle cores.
 
-Contenders take turns. Writes ``results/bench/scale.json``, of which ``python docs/make_speed.py``
+Contenders take turns. Writes ``results/bench/scale.json``, of which ``python docs/make_results.py``
 makes the tables of docs/scale.md: what was measured, and a model of many workers from it.
 """
 

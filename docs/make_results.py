@@ -1,18 +1,15 @@
-"""Write the tables of results: ``python docs/make_results.py`` after ``results/`` has changed."""
+"""Write every table and plot: ``python docs/make_results.py`` after ``results/`` has changed."""
 
 from collections.abc import Sequence
 from functools import cache
 from statistics import median
 
+import make_speed
+import make_tables
 from make_tables import TABLE_2, pieces
 from pages import NOT_RUN, Row, Runs, chosen, difference, gain, ran, rate, read, success, write
 
-from ifo_grounding.report import (
-    figure_png,
-    markdown_table,
-    rates_by_number,
-    training_curves,
-)
+from ifo_grounding.report import figure_png, markdown_table, rates_by_number, training_curves
 from ifo_grounding.report.results import brief, unpacked
 from ifo_grounding.stats import Difference, Rate, holm, paired_difference
 from ifo_grounding.tasks import TASKS
@@ -64,19 +61,11 @@ def over_continued(runs: Runs) -> str:
     return brief(difference(ran, "continued", "phase2")) + aside
 
 
-def few_rows(found: dict[tuple[str, int], Runs]) -> list[Row]:
-    """Return the README's rows: what self-examination adds where demonstrations are few."""
-    return [
-        {
-            "task": task,
-            "demonstrations": number,
-            "seeds": len(runs),
-            "imitation": success(runs, "phase1"),
-            "after self-examination": success(runs, "phase2"),
-            "difference, points": gain(runs),
-        }
-        for (task, number), runs in found.items()
-    ]
+def readme_row(row: Row) -> Row:
+    """Return the README's columns: what self-examination adds where demonstrations are few."""
+    phases = {"imitation": row["phase 1"], "after self-examination": row["phase 2"]}
+    named = {key: row[key] for key in ("task", "demonstrations", "seeds")}
+    return {**named, **phases, "difference, points": row["gain, points"]}
 
 
 def choice_rows(number: int) -> list[Row]:
@@ -204,26 +193,30 @@ def minutes(runs: Runs) -> int:
 
 def tables() -> dict[str, str]:
     """Return every table by name."""
-    rows, shown = study_rows(), {("move", 50), *((task, 200) for task in TASKS)}
+    few = {("move", 50), *((task, 200) for task in TASKS)}
+    rows = study_rows()
     found: dict[str, list[Row]] = {
-        "few": few_rows({key: runs for key, runs in studied().items() if key in shown}),
-        "results": [row for key, row in rows.items() if key in shown],
-        "up-to-2000": [row for key, row in rows.items() if key not in shown and key[1] <= 2000],
+        "few": [readme_row(row) for key, row in rows.items() if key in few],
+        "results": [row for key, row in rows.items() if key in few],
+        "up-to-2000": [row for key, row in rows.items() if key not in few and key[1] <= 2000],
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
         "baselines": baseline_rows("move", 2000),
         "peers": peer_rows(),
     }
-    return {name: markdown_table(rows) for name, rows in found.items()}
+    here = {name: markdown_table(rows) for name, rows in found.items()}
+    return here | make_tables.tables() | make_speed.tables()
+
+
+def pictures() -> dict[str, bytes]:
+    """Return every plot of results by the name of its file."""
+    babyai = rates_by_number(curves(runs_of("babyai", LEVELS), POLICIES))
+    return {
+        "efficiency.png": efficiency_picture(),
+        "babyai.png": figure_png(babyai),
+        "baselines.png": baseline_curves("move", 2000),
+    }
 
 
 if __name__ == "__main__":
-    babyai = figure_png(rates_by_number(curves(runs_of("babyai", LEVELS), POLICIES)))
-    write(
-        tables(),
-        {
-            "efficiency.png": efficiency_picture(),
-            "babyai.png": babyai,
-            "baselines.png": baseline_curves("move", 2000),
-        },
-    )
+    write(tables(), pictures())

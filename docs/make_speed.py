@@ -1,10 +1,9 @@
-"""Write the table of speeds: ``python docs/make_speed.py`` after ``make bench``."""
+"""The tables of speeds, of what ``make bench`` and ``benchmarks/scale.py`` measured."""
 
 from collections.abc import Collection
 from typing import Any
 
-from matplotlib.figure import Figure
-from pages import ASSETS, RESULTS, write
+from pages import RESULTS
 
 from ifo_grounding.files import read_json
 from ifo_grounding.report import markdown_table
@@ -13,7 +12,7 @@ OURS = "ifo-grounding"
 ORDER = (
     *("step", "pixels", "worlds", "worlds-pixels", "rollout", "gymnasium", "collector-strong"),
     *("collector-paper", "sampler", "imitation-strong", "imitation-paper"),
-    *("labelling", "transitions", "recording", "memory", "whole", "growth"),
+    *("labelling", "transitions", "recording", "memory", "whole"),
 )
 """Of the rows in the tables; others come last."""
 
@@ -80,49 +79,26 @@ def on_device(rows: dict[str, dict[str, Any]], said: Collection[str] = ()) -> st
 
 def of_scale() -> str:
     """Return the tables of what was measured of Ray and torchrun, and of the model made of it."""
-    path = RESULTS / "bench" / "scale.json"
-    found = read_json(path) if path.exists() else {"rows": {}}
-    reach = {
-        "pieces": ("pieces of a table, 2 Ray workers", "0.95 times jobs=2"),
-        "practice": ("BabyAI practice, 2 collectors", "1.6 times one process"),
-        "imitation": ("imitation, 2 processes", "1.7 times one process"),
-    }
+    found = read_json(RESULTS / "bench" / "scale.json")
     lines = []
-    for name, (what, asked) in reach.items():
-        row = found["rows"].get(name)
-        ratio = between(next(iter(row["ratios"].values()))) if row else "not measured"
-        lines.append({"what": what, "asked": asked, "measured": ratio})
-    parts = [markdown_table(lines)]
-    if "growth" in found:
-        rows, limit = found["growth"]["rows"], found["growth"]["limit"]
-        of = {"frames/s": "frames/s", "bound": "if learning took no time"}
-        model = [
-            {"workers": f"{row['workers']}", **{of[name]: short(row[name]) for name in of}}
-            for row in rows[::2]
-        ]
-        text = (
-            "A model of BabyAI practice, 64 worlds a worker, 1 Gbit/s, from one process's times. "
-            "Workers wait while the learner receives and learns: beyond "
-            f"{limit['frames/s']:.1f} workers it is the bottleneck, beyond {limit['bound']:.0f} if "
-            "learning took no time."
-        )
-        parts += [text, markdown_table(model)]
-    return "\n\n".join(parts)
-
-
-def draw_growth() -> None:
-    """Draw how long things take by their size, and a line along which cost grows as size does."""
-    curves = measured("cpu")["growth"]["curves"]
-    figure = Figure(figsize=(9.6, 3.2), layout="constrained")
-    for axes, (name, curve) in zip(figure.subplots(1, len(curves)), curves.items(), strict=True):
-        sizes = sorted(map(int, curve))
-        seconds = [curve[str(size)] for size in sizes]
-        axes.loglog(sizes, [seconds[-1] * size / sizes[-1] for size in sizes], "--", label="linear")
-        axes.loglog(sizes, seconds, marker="o", markersize=4, label="measured")
-        axes.set_title(name, fontsize=9, loc="left")
-        axes.set_ylabel("seconds")
-        axes.legend(frameon=False, fontsize=8)
-    figure.savefig(ASSETS / "growth.png", dpi=150)
+    for row in found["rows"].values():
+        for against, ratio in row["ratios"].items():
+            (ours,) = row["rates"].keys() - row["ratios"].keys()
+            line = {"what": f"{row['name']}: {ours}", "times as fast as": against}
+            lines.append({**line, "measured": between(ratio), "asked": row["reach"][against]})
+    rows, limit = found["growth"]["rows"], found["growth"]["limit"]
+    of = {"frames/s": "frames/s", "bound": "if learning took no time"}
+    model = [
+        {"workers": f"{row['workers']}", **{title: short(row[key]) for key, title in of.items()}}
+        for row in rows[::2]
+    ]
+    text = (
+        "A model of BabyAI practice, 64 worlds a worker, 1 Gbit/s, from one process's times. "
+        "Workers wait while the learner receives and learns: beyond "
+        f"{limit['frames/s']:.1f} workers it is the bottleneck, beyond {limit['bound']:.0f} if "
+        "learning took no time."
+    )
+    return "\n\n".join([markdown_table(lines), text, markdown_table(model)])
 
 
 def tables() -> dict[str, str]:
@@ -131,8 +107,3 @@ def tables() -> dict[str, str]:
     here = measured("cpu")
     gpu = on_device(there, said=here)
     return {"speed": on_device(here), "speed-gpu": gpu, "scale": of_scale()}
-
-
-if __name__ == "__main__":
-    write(tables(), {})
-    draw_growth()

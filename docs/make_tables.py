@@ -1,16 +1,18 @@
-"""Write the paper's tables and figures with the numbers of here: ``python docs/make_tables.py``."""
+"""The paper's tables and figures with the numbers of here."""
 
 import math
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from pages import NOT_RUN, Row, Runs, chosen, difference, gain, percent, read, success, write
+from pages import NOT_RUN, Row, Runs, chosen, difference, gain, percent, read, success
 
+from ifo_grounding.evaluation.endings import ENDINGS
 from ifo_grounding.report import markdown_table
 from ifo_grounding.report.results import brief
 from ifo_grounding.stats import Rate, wilson
 from ifo_grounding.tasks import TASKS
+from ifo_grounding.tasks.goals import REASONS
 
 PRESETS = ("paper", "strong")
 EPISODES = 500
@@ -29,8 +31,6 @@ TABLE_4 = dict(
     zip(TASKS, ((62.8, 68.4), (56.8, 60.6), (11.2, 14.6), (27.4, 29.8), (19.8, 21.0)), strict=True)
 )
 """The paper's success on held-out pairs of colour and shape, after phase 1 and after phase 2."""
-ERRORS = ("missing", "ambiguous", "out of bounds", "occupied", "already true")
-FAILURES = ("stuck", "wrong object", "wrong place", "nothing done")
 
 
 @cache
@@ -115,14 +115,14 @@ def counts(phase: str, preset: str, cells: Callable[[Runs], Row]) -> list[Row]:
 def wrong_choices(runs: Runs) -> Row:
     """Return Figure 5: what is wrong with unsuitable choices, added over seeds."""
     errors = [run["results"]["suitability"]["errors"] for run in runs]
-    return {name: f"{sum(one[name] for one in errors):,}" for name in ERRORS}
+    return {name: f"{sum(one[name] for one in errors):,}" for name in REASONS[1:-1]}
 
 
 def changes(runs: Runs) -> Row:
     """Return Figure 6: scenes that one phase alone solves, by how the other one failed there."""
     found = [run["results"]["changes"] for run in runs]
     row = {}
-    for name in FAILURES:
+    for name in ENDINGS[1:]:
         won, lost = (sum(one[part][name] for one in found) for part in ("gained", "lost"))
         row[name] = f"{won:,} / {lost:,}"
     paths = (sum(one[f"{which} path"] for one in found) for which in ("other", "same"))
@@ -146,7 +146,3 @@ def tables() -> dict[str, str]:
         "figure-6-goals": counts("goal-pairs-5000", "paper", changes),
     }
     return {name: markdown_table(rows) for name, rows in found.items()}
-
-
-if __name__ == "__main__":
-    write(tables(), {})
