@@ -99,27 +99,31 @@ class InstructionSampler(InstructionTransform):
         ``states_served`` are those that got an instruction, ``served_share`` their share of
         ``states_drawn``; ``mean_score`` is the mean probability of the chosen pairs.
         """
+        served = float(self._served)
         stats = {
             "states_drawn": float(self._drawn),
-            "states_served": float(self._served),
-            "served_share": self._served / max(self._drawn, 1),
+            "states_served": served,
+            "served_share": served / max(self._drawn, 1),
             "candidates_scored": float(self.scorer.scored),
-            "mean_score": self._score_sum / max(self._served, 1),
+            "mean_score": float(self._score_sum) / max(served, 1),
         }
         self._clear_stats()
         return stats
 
     def _clear_stats(self) -> None:
-        self._drawn = self._served = self.scorer.scored = 0
-        self._score_sum = 0.0
+        self._drawn = self.scorer.scored = 0
+        # Added up where they are computed: a GPU is asked for them in stats().
+        self._served = torch.zeros((), dtype=torch.int64)
+        self._score_sum = torch.zeros(())
 
     def _choose(self, pixels: Tensor) -> Choices:
         self.scorer.classifier = self.classifier  # another one may have been put there
         choices = self.scorer.choose(pixels, generator=self.generator, **self.options)
         found = choices.chosen >= 0
         self._drawn += len(found)
-        self._served += int(found.sum())
-        self._score_sum += float(choices.score[found].sum())
+        self._served = self._served.to(found.device) + found.sum()
+        scores = choices.score.where(found, 0.0).sum()
+        self._score_sum = self._score_sum.to(found.device) + scores
         return choices
 
     def _reset(
@@ -130,17 +134,16 @@ class InstructionSampler(InstructionTransform):
         waiting = self.new_rows(tensordict, rows)
         home = tensordict_reset.get(self.in_keys[0]).device
         instruction = self.tokens.new_zeros(rows, self.tokens.shape[1], device=home)
-        best_score, attempt = 0.0, 0
+        best_score, attempt = torch.zeros((), device=home), 0
         while len(waiting) and attempt < self.max_tries:
             if attempt:
                 tensordict_reset = self._draw_again(tensordict_reset, waiting)
             waiting = waiting.to(home)
             index, score = self._choose(rows_of(tensordict_reset, self.in_keys[0])[waiting])
-            found = index >= 0
-            instruction[waiting[found]] = self.tokens.to(home)[index[found]]
-            waiting = waiting[~found]
+            instruction[waiting] = self.tokens.to(home)[index]  # of rows without any, the last one
+            best_score = torch.maximum(best_score, score.max())
+            waiting = waiting[index < 0]
             attempt += 1
-            best_score = max(best_score, float(score.max()))
         if len(waiting):
             raise NothingSuitableError(
                 f"no instruction of the pool scored above {self.options['threshold']} on any of "
