@@ -47,7 +47,7 @@ from ifo_grounding.baselines import (
     SteppableDemonstrations,
     steps_of_policy,
 )
-from ifo_grounding.baselines.config import METHODS
+from ifo_grounding.baselines.config import METHODS, PLANNED
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import STAGES, Options
 from ifo_grounding.data import Collected, Truth, label_demonstrations
@@ -182,8 +182,8 @@ def bco_alpha(options: Options) -> Run:
 def planned(options: Options) -> LCRL:
     """Return LC-RL with the reward that it learned, learned now if it has to be."""
     stage, world = trained_by(options), world_of(options)
-    if options.task not in ("move", "move-udlr"):
-        raise UserError("lc-rl plans the arm's cells: task=move or task=move-udlr")
+    if options.task not in PLANNED:
+        raise UserError(f"lc-rl plans the arm's cells: task={' or task='.join(PLANNED)}")
     run, demos = stage.run, load_demonstrations(stage.run)
     env = world.steppable(ROWS, seed=options.seed)
     truth = Truth.load(run.need(TRUTH, "record_demonstrations"))

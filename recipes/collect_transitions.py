@@ -11,12 +11,12 @@ def collect(options: Options) -> dict:
     stage = open_stage(options, "collect_transitions")
     if stage.result is not None:
         return stage.result
-    section = options.transitions
+    section, stop = options.transitions, world_of(options).stop_action
     collected = collect_transitions(
         simulator_of(options, section.num_envs),
         section.n,
-        stop_probability=section.stop_probability,
-        stop_action=world_of(options).stop_action,
+        stop_probability=None if stop is None else section.stop_probability,
+        stop_action=stop,
         drop_unchanged=section.drop_unchanged,
         seed=options.seed,
         progress=options.progress,

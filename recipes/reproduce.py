@@ -16,7 +16,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from tqdm import tqdm
 
-from ifo_grounding.baselines.config import METHODS
+from ifo_grounding.baselines.config import METHODS, PLANNED
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.cluster import Call, run_on_cluster
 from ifo_grounding.errors import UserError, check_choice
@@ -198,15 +198,17 @@ def of_methods(
         {"task": task, "preset": preset, "seed": seed, "demonstrations": {"n": n}},
         options.method,
     ]
+    methods = [method for method in METHODS if method != "lc-rl" or task in PLANNED]
     if not options.tune:
-        for method in METHODS:
+        for method in methods:
             file = f"baselines/{name}-{method}-seed{seed}.json"
             run = f"baselines-{name}-seed{seed}"
             yield replace(
                 call(options, run, [*chosen, {"method": method}], file, None), recipe="baselines"
             )
         return
-    for method, space in options.tuning.items():
+    for method in (method for method in methods if method in options.tuning):
+        space = options.tuning[method]
         for number, values in enumerate(product(*space.values())):
             trial = dict(zip(space, values, strict=True))
             of_trial = {"method": method, "variant": f"trial{number}"}

@@ -42,7 +42,7 @@ def two_phase(options: Options) -> dict:
         if name == "record_demonstrations" and (reason := phase_1_alone(options)):
             print(f"phase 1 alone: {reason}", flush=True)
             last = min(last, STAGES.index("imitate"))
-    if not world_of(options).judged:
+    if last < STAGES.index("imitate") or not world_of(options).judged:
         return {}
     if options.controls.run and last == len(STAGES) - 1:
         continue_imitation(options)
@@ -107,7 +107,8 @@ def stages_of(options: Options) -> dict[str, Callable[[Options], dict]]:
 def main(options: Options) -> dict:
     results = two_phase(options)
     if not results:
-        print(f"nobody knows success in this world: ifo-grounding play run={options.run}")
+        if not world_of(options).judged:
+            print(f"nobody knows success in this world: ifo-grounding play run={options.run}")
         return results
     page = report(options, results)
     table = [{"in unseen scenes": k, "[95% interval]": v} for k, v in headline(results).items()]

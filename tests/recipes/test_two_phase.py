@@ -144,6 +144,14 @@ def test_a_stage_without_what_it_needs_says_what_to_run(options, tmp_path, monke
     assert not (tmp_path / "run").exists()
 
 
+def test_a_run_until_its_labels_is_not_evaluated(options):
+    from imitate import imitate
+    from two_phase import two_phase
+
+    assert two_phase(options("until=label")) == {}
+    assert imitate(options())["step"] == 20  # which needs no other stage
+
+
 @pytest.mark.parametrize(
     ("pool", "closed", "world", "said"),
     [

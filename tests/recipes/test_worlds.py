@@ -55,6 +55,15 @@ def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
     assert world[0] == "world=gymnasium" or "dial" in report(given).read_text()
 
 
+def test_a_world_without_a_stop_is_imitated_in(options, dial, capsys):
+    from two_phase import two_phase
+
+    world = ("world.factory=own_dial.Dial", "world.image=view", "world.instruction=task")
+    results = two_phase(options(dial, "world=gymnasium", *world, *TURN))
+    assert "the world has no stop" in capsys.readouterr().out
+    assert results["phase1"]["rate"]["count"] == 20 and "phase2" not in results
+
+
 def test_what_nobody_judges_is_trained_and_then_played(options, tmp_path, monkeypatch):
     monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path / "home"))
     from evaluate import evaluate
