@@ -161,8 +161,11 @@ def build(make: Any, options: Options, **kwargs: Any) -> Any:
     """Build a network for the simulator's images, words and actions."""
     chosen = {"seed": options.seed, "device": options.device, **options.networks.changed()}
     network = make(coded_simulator(options), options.preset, **{**chosen, **kwargs})
-    if network.network_config.shapes.fit(words := world_of(options).vocabulary):
-        network.vocabulary = words
+    world = world_of(options)
+    if network.network_config.shapes.fit(world.vocabulary):
+        network.vocabulary = world.vocabulary
+    if world.tiles is not None:
+        networks.read_codes(network, world.tiles)
     return network
 
 
@@ -267,8 +270,7 @@ def chosen_by(options: Options) -> dict[str, Any]:
 
 def evaluation_scenes(options: Options) -> dict[str, Any]:
     """Return which scenes to evaluate on."""
-    section = options.evaluate
-    return {"seed": section.seed, "stream": section.stream, "split": section.split}
+    return {name: getattr(options.evaluate, name) for name in ("seed", "stream", "split")}
 
 
 def result_file(options: Options) -> Path:

@@ -221,8 +221,9 @@ def adversarial(options: Options) -> Run:
         return stage.run
     run, world = stage.run, world_of(options)
     begun = load_network(run, REFERENCE, "baselines", options) if method == "gail+bc" else None
-    policy = build(make_policy, options) if begun is None else begun
-    value = build(make_value, options, init_from=policy)
+    context = options.imitate.context
+    policy = build(make_policy, options, context=context) if begun is None else begun
+    value = build(make_value, options, init_from=policy, context=context)
     seen, more = access(options, run), options.networks.changed()
     if method == "gaifo":
         more["inverse"] = load_network(run, INVERSE, "train_inverse", options)
@@ -233,6 +234,7 @@ def adversarial(options: Options) -> Run:
         lr=section.lr,
         swapped=section.swapped,
         stop_action=world.stop_action,
+        shapes=policy.network_config.shapes,
         seed=options.seed,
         device=options.device,
         **more,

@@ -8,13 +8,33 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from ifo_grounding.errors import UserError
+
 PIXELS_PER_WORD = 8
+MOST_TILES = 1 << 15
+"""Their numbers are int16."""
 CHUNK_BYTES = 4 << 20
 """Pixels that are laid at a time on a CPU: they fit its cache."""
+
+
+def check_tiles(tiles: Any) -> None:
+    """Refuse what are no tiles, uint8 [K, C, T, T]."""
+    some = isinstance(tiles, Tensor) and tiles.ndim == 4 and tiles.dtype == torch.uint8
+    if not some or tiles.shape[2] != tiles.shape[3] or tiles.shape[3] % PIXELS_PER_WORD:
+        what = f"{tiles.dtype} {[*tiles.shape]}" if isinstance(tiles, Tensor) else tiles
+        raise UserError(
+            "tiles are uint8 [K, C, T, T] with T a multiple of 8, such as env.tiles of "
+            f"PickAndPlaceEnv(codes=True), got {what}"
+        )
+    if len(tiles) > MOST_TILES:
+        raise UserError(
+            f"their numbers are int16: at most {MOST_TILES:,} tiles, got {len(tiles):,}"
+        )
 
 
 def as_words(pixels: Tensor) -> Tensor:

@@ -1,12 +1,14 @@
 """Rivals of Table 1: what each may use, what its discriminator learns and pays."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
+from ifo_grounding import networks
 from ifo_grounding.baselines import (
     AGILE,
     GAIL,
@@ -175,11 +177,28 @@ def test_a_change_is_scored_as_the_kind_that_it_looks_like():
     def inverse(before, after):
         return torch.stack([after, -after, 9.0 * before.squeeze(-1)], -1)
 
-    network = ChangeNetwork(inverse, Kinds())
     before, after, said = torch.full((2, 1), 3.0), torch.full((2,), math.log(2)), torch.tensor(0.5)
-    scored = network(before, after, torch.tensor([[False], [True]]), said)
+    ended = torch.tensor([[False], [True]])
+    scored = ChangeNetwork(inverse, Kinds(), stop=2)(before, after, ended, said)
     # Odds of 4 to 1 for the first kind, whose score is 3, of the other -6; the end's is 10.5.
     torch.testing.assert_close(scored, torch.tensor([[0.8 * 3 - 0.2 * 6], [10.5]]))
+    scored = ChangeNetwork(inverse, Kinds(), stop=0)(before, after, ended, said)
+    torch.testing.assert_close(scored, torch.tensor([[10.5], [3.0]]))  # all else is the third kind
+    scored = ChangeNetwork(inverse, Kinds(), stop=None)(before, after, ended, said)
+    torch.testing.assert_close(scored, torch.tensor([[10.5], [10.5]]))
+
+
+@pytest.mark.parametrize("method", [GAIL, GAIfO])
+def test_a_discriminator_is_built_for_the_actions_of_its_world(method, sources):
+    seen, shapes = sources["frames"], networks.Shapes.of(sources["frames"])
+    source = sources["actions"] if method is GAIL else seen
+    adversary = method(source, shapes=replace(shapes, n_actions=7), **SMALL)
+    sizes = {
+        part.shapes.n_actions
+        for part in adversary.network.modules()
+        if isinstance(part, networks.base.ImageNetwork)
+    }
+    assert sizes == {7}
 
 
 @pytest.mark.parametrize("name", ["actions", "frames", "steps"])

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from ifo_grounding.data import first_frame_buffer, record_demonstrations, show_codes
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.mosaic import as_words, assemble
@@ -134,6 +135,25 @@ def test_numbers_of_tiles_that_a_network_does_not_know_are_refused(kind, shapes)
         data[key] = data[key][:, 1:]
     with pytest.raises(UserError, match="images of 48 x 48 pixels, got 5 x 6 tiles of 8"):
         run(kind, module, data)
+    read_codes(module, env.tiles[:3])
+    with pytest.raises(UserError, match=r"hold tile \d+: allowed are 0\.\.2"):
+        run(kind, module, data)
+
+
+def test_what_are_no_tiles_of_a_network_is_refused(shapes):
+    policy, tiles = MAKERS["policy"](shapes, seed=0), PickAndPlaceEnv(codes=True).tiles
+    buffer = first_frame_buffer(record_demonstrations("move", 2, seed=0))
+    for wrong in (PickAndPlaceEnv().tiles, tiles.float(), tiles[0], tiles[..., :4]):
+        with pytest.raises(UserError, match=r"tiles are uint8 \[K, C, T, T\]"):
+            read_codes(policy, wrong)
+        with pytest.raises(UserError, match=r"tiles are uint8 \[K, C, T, T\]"):
+            show_codes(buffer, wrong)
+    with pytest.raises(UserError, match="at most 32,768 tiles"):
+        read_codes(policy, tiles[:1].expand(1 << 16, -1, -1, -1))
+    with pytest.raises(UserError, match="1 channels, and images for this network 3"):
+        read_codes(policy, tiles[:, :1])
+    with pytest.raises(UserError, match="Linear holds no network"):
+        read_codes(torch.nn.Linear(1, 1), tiles)
 
 
 def test_keys_can_be_nested(kind, shapes):

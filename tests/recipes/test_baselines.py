@@ -4,6 +4,7 @@ import shutil
 
 import pytest
 
+from ifo_grounding import networks
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import STAGES
 from ifo_grounding.errors import UserError
@@ -53,6 +54,15 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
     stamp = trained.stat().st_mtime_ns if trained.exists() else None
     assert baseline(given) == results
     assert stamp is None or trained.stat().st_mtime_ns == stamp
+
+
+def test_a_rival_has_the_policy_of_the_run(options, tmp_path):
+    from baselines import baseline
+
+    given = options(*FEWER, "imitate.context=1", "method=gail+bc", run="wide")
+    assert 0 <= baseline(given)["gail+bc"]["rate"]["rate"] <= 1
+    policy = networks.load(tmp_path / "wide" / "policy-gail+bc.safetensors")
+    assert policy.network_config.config.context == 1
 
 
 def test_a_rival_that_needs_what_a_world_lacks_says_so(practised, options, tmp_path):

@@ -5,15 +5,17 @@ import sys
 
 import pytest
 import torch
+from torchrl.envs import TransformedEnv, UnaryTransform
 
 from envs import dial as dial_module
 from ifo_grounding import networks
 from ifo_grounding.data import Demonstrations
+from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
 from ifo_grounding.playground import Lesson
-from ifo_grounding.worlds import OpenGrid
+from ifo_grounding.worlds import Grid, OpenGrid
 
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
 
@@ -53,6 +55,36 @@ def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
     policy = networks.load(tmp_path / "run" / "policy-phase2.safetensors")
     assert policy.network_config.shapes.n_actions == 3 and "dial" in policy.vocabulary.words
     assert world[0] == "world=gymnasium" or "dial" in report(given).read_text()
+
+
+class Dimmed(Grid):
+    """A grid whose simulator shows other pictures than the library's."""
+
+    def simulator(self, num_envs, *, seed, device="cpu"):
+        shown = super().simulator(num_envs, seed=seed, device=device)
+        return TransformedEnv(shown, UnaryTransform(["pixels"], ["pixels"], fn=lambda x: x // 2))
+
+
+class Tiled(Grid):
+    """One that shows numbers of tiles by a transform of its own."""
+
+    tiles = PickAndPlaceEnv(codes=True).tiles
+
+    def coded(self, num_envs, **options):
+        return TransformedEnv(PickAndPlaceEnv(self.task, num_envs, instructed=False, codes=True))
+
+
+def test_own_grids_show_pixels_or_the_codes_that_they_say(options):
+    from _shared import build, world_of
+
+    dimmed, plain = (kind("move").coded(2, seed=0).reset()["pixels"] for kind in (Dimmed, Grid))
+    assert dimmed.dtype == torch.uint8 and plain.dtype == torch.int16
+    assert Dimmed("move").tiles is None and Grid("move").tiles is not None
+    given = options("world=own", f"world._target_={__name__}.Tiled", "+world.task=move")
+    policy = build(networks.make_policy, given)
+    seen = world_of(given).coded(2, seed=0).reset()
+    seen["instruction"] = torch.ones(2, 16).long()
+    assert seen["pixels"].dtype == torch.int16 and policy(seen)["logits"].isfinite().all()
 
 
 def test_a_world_without_a_stop_is_imitated_in(options, dial, capsys):

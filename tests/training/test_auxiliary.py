@@ -17,7 +17,13 @@ from ifo_grounding.training import (
     HeldOutAccuracy,
     self_examine,
 )
+from ifo_grounding.training.updates import means
 from training import tiny
+
+
+def test_metrics_that_some_updates_lack_are_means_of_the_others():
+    updates = [{"loss": torch.tensor(1.0)}, {"loss": torch.tensor(2.0), "rare": torch.tensor(4.0)}]
+    assert means(updates) == {"loss": 1.5, "rare": 4.0}
 
 
 def reward_loss(seed=0):

@@ -7,11 +7,7 @@ from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.networks import make_instruction_classifier, make_policy, make_reward_model
 from ifo_grounding.objectives import ImitationLoss, InstructionLoss, RewardLoss
 from ifo_grounding.training import FitConfig, fit
-from ifo_grounding.training.updates import (
-    let_capture,
-    make_optimizer,
-    set_rate,
-)
+from ifo_grounding.training.updates import let_capture, make_optimizer, set_rate
 
 
 def test_an_optimizer_is_captured_or_not_whatever_a_checkpoint_says():

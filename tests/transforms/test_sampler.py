@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
 
 from ifo_grounding.envs import PickAndPlaceEnv
@@ -111,6 +112,15 @@ def test_called_on_states_it_chooses_for_each():
         sampler(states)
     kept = states[shown(states["pixels"]) < 9]
     assert suits(sampler(kept)).all()
+
+
+def test_what_a_buffer_stores_stays_as_it_is():
+    sampler = InstructionSampler(classifier(), POOL)
+    stored = TensorDict({"pixels": CounterWorld((4,)).reset()["pixels"]}, [4])
+    before = stored.clone()
+    assert "instruction" in sampler(stored) and "instruction" not in stored
+    assert torch.equal(stored["pixels"], before["pixels"])
+    assert sampler(stored[:0])["instruction"].shape == (0, POOL.shape[1])
 
 
 def test_nothing_suitable_is_one_clear_line():

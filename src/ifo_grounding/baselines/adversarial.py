@@ -152,6 +152,8 @@ class Adversary(AdversarialUpdates):
         preset: of the network.
         steps: gradient steps after each iteration.
         stop_action: the action by which a policy ends an episode.
+        shapes: what the network is built for, such as the policy's ``network_config.shapes``; by
+            default the demonstrations, with the six actions of the own world.
         options: for the network, such as ``seed`` and ``device``.
 
     Raises:
@@ -175,10 +177,12 @@ class Adversary(AdversarialUpdates):
         batch_size: int = 256,
         swapped: bool = True,
         stop_action: int | None = keys.STOP,
+        shapes: Any = None,
         **options: Any,
     ) -> None:
         check_access(self, seen, self.access)
-        self.network = self.discriminator(frames_of(seen), preset, **options)
+        self.stop_action = stop_action
+        self.network = self.discriminator(shapes or frames_of(seen), preset, **options)
         self.reward = self.paid(stop_action)
         loss = DiscriminatorLoss(self.network, spare=self.spare, swapped=swapped)
         super().__init__(loss, self.demonstrated(seen), steps, lr, batch_size)
@@ -187,7 +191,7 @@ class Adversary(AdversarialUpdates):
         """Return the demonstrated steps that are told apart from the policy's."""
         raise NotImplementedError
 
-    def discriminator(self, demos: Demonstrations, preset: str, **options: Any) -> TensorDictModule:
+    def discriminator(self, shapes: Any, preset: str, **options: Any) -> TensorDictModule:
         """Return the network."""
         raise NotImplementedError
 
@@ -209,8 +213,8 @@ class GAIL(Adversary):
     def demonstrated(self, seen: ActionDemonstrations) -> TensorDictReplayBuffer:  # noqa: D102
         return seen.transitions()
 
-    def discriminator(self, demos: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
-        return make_reward_model(demos, preset, **options)
+    def discriminator(self, shapes: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
+        return make_reward_model(shapes, preset, **options)
 
 
 class ChangeNetwork(nn.Module):
@@ -221,9 +225,9 @@ class ChangeNetwork(nn.Module):
     changes nothing. Both models learn together, and read no action.
     """
 
-    def __init__(self, inverse: nn.Module, reward: RewardNetwork) -> None:
+    def __init__(self, inverse: nn.Module, reward: RewardNetwork, stop: int | None) -> None:
         super().__init__()
-        self.inverse, self.reward = inverse, reward
+        self.inverse, self.reward, self.stop = inverse, reward, stop
 
     def forward(self, before: Tensor, after: Tensor, ended: Tensor, instruction: Tensor) -> Tensor:
         """Weigh the score of each kind by how much the change is of that kind.
@@ -234,8 +238,13 @@ class ChangeNetwork(nn.Module):
             ended: whether the episode ends there by a stop, bool [*B, 1].
             instruction: token ids, int64 [*B, L].
         """
-        kinds = self.inverse(before, after)[..., :-1].softmax(-1) * ~ended
-        kinds = torch.cat([kinds, ended.to(kinds.dtype)], -1)
+        logits = self.inverse(before, after)
+        if self.stop is None:
+            kinds = logits.softmax(-1)
+        else:
+            stop = torch.arange(logits.shape[-1], device=logits.device) == self.stop
+            kinds = logits.masked_fill(stop, -torch.inf).softmax(-1)
+            kinds = torch.where(ended, stop.to(kinds.dtype), kinds)
         return (kinds * self.reward.all_actions(before, instruction)).sum(-1, keepdim=True)
 
 
@@ -250,9 +259,10 @@ class GAIfO(Adversary):
     def demonstrated(self, seen: Demonstrations) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(seen)
 
-    def discriminator(self, demos: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
-        inverse = options.pop("inverse", None) or make_inverse(demos, preset, **options)
-        network = ChangeNetwork(inverse.module, make_reward_model(demos, preset, **options).module)
+    def discriminator(self, shapes: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
+        inverse = options.pop("inverse", None) or make_inverse(shapes, preset, **options)
+        reward = make_reward_model(shapes, preset, **options)
+        network = ChangeNetwork(inverse.module, reward.module, self.stop_action)
         in_keys = [keys.PIXELS, AFTER, ENDED, keys.INSTRUCTION]
         return TensorDictModule(network, in_keys, ["change_score"]).eval()
 
@@ -270,9 +280,9 @@ class AGILE(Adversary):
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(frames_of(seen), last=True)
 
-    def discriminator(self, demos: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
+    def discriminator(self, shapes: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
         in_keys = (AFTER, keys.INSTRUCTION)
-        return make_instruction_classifier(demos, preset, in_keys=in_keys, **options)
+        return make_instruction_classifier(shapes, preset, in_keys=in_keys, **options)
 
     def paid(self, stop_action: int | None) -> DiscriminatorReward:  # noqa: D102
         if stop_action is None:

@@ -115,7 +115,7 @@ class LCRL:
         seen: true actions, and a simulator that begins where demonstrations began.
         size: cells along one side of the world.
         preset: of the reward network.
-        horizon: most moves of a plan.
+        horizon: most moves of a plan; by default as many as two sides of the world.
         options: for the network.
 
     Raises:
@@ -131,11 +131,11 @@ class LCRL:
         preset: str = "strong",
         *,
         lr: float = 1e-3,
-        horizon: int = 12,
+        horizon: int | None = None,
         **options: Any,
     ) -> None:
         check_access(self, seen, self.access)
-        self.seen, self.size, self.horizon = seen, size, horizon
+        self.seen, self.size, self.horizon = seen, size, horizon or 2 * size
         self.moves = neighbours(size)
         self.network: TensorDictModule = make_instruction_classifier(seen.demos, preset, **options)
         self.optimizer = make_optimizer(self.network.parameters(), lr)

@@ -114,6 +114,7 @@ def show_codes(buffer: Any, tiles: Tensor) -> None:
     >>> buffer[:]["pixels"].shape
     torch.Size([4, 6, 6])
     """
+    mosaic.check_tiles(tiles)
     for part in buffer.transform.modules():
         if isinstance(part, FrameDecoder):
             part.show_codes(tiles)

@@ -110,7 +110,9 @@ def compare_success(before: SuccessResult, after: SuccessResult) -> Difference:
         UserError: where the scenes or the modes differ.
     """
     if before.scenes != after.scenes or len(before.outcomes) != len(after.outcomes):
-        raise UserError("the two are about different scenes: use the same seed, stream and options")
+        raise UserError(
+            "the two are about different scenes: use the same seed, stream, options and codes"
+        )
     if before.mode != after.mode:
         raise UserError(f"cannot compare a {before.mode} with a {after.mode} policy")
     return paired_difference(before.outcomes.numpy(), after.outcomes.numpy())

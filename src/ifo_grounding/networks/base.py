@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import UserError, check_below
+from ifo_grounding.mosaic import check_tiles
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.patches import Mosaics
 from ifo_grounding.networks.shapes import Shapes, grid_of
@@ -64,6 +65,8 @@ class ImageNetwork(nn.Module):
                 "that shows them, or tell it what they are, networks.read_codes(network, env.tiles)"
             )
         codes = codes.reshape(-1, *codes.shape[-2:])
+        if not codes.is_cuda:  # which would have to be waited for
+            check_below("images for this network hold tile", codes, len(self.tiles))
         _, height, width = self.shapes.image_shape
         side = self.tiles.shape[-1]
         if (side * codes.shape[1], side * codes.shape[2]) != (height, width):
@@ -92,9 +95,17 @@ def read_codes(module: nn.Module, tiles: Tensor) -> None:
     >>> env.rollout(5, policy)["pixels"].shape
     torch.Size([1, 5, 6, 6])
     """
-    for part in module.modules():
-        if isinstance(part, ImageNetwork):
-            part.tiles = tiles.to(next(part.parameters()).device)
+    check_tiles(tiles)
+    parts = [part for part in module.modules() if isinstance(part, ImageNetwork)]
+    if not parts:
+        raise UserError(f"{type(module).__name__} holds no network of this package")
+    for part in parts:
+        if tiles.shape[1] != part.shapes.image_shape[0]:
+            raise UserError(
+                f"tiles have {tiles.shape[1]} channels, and images for this network "
+                f"{part.shapes.image_shape[0]}"
+            )
+        part.tiles = tiles.to(next(part.parameters()).device)
 
 
 def same_batch(**batches: torch.Size) -> None:

@@ -41,8 +41,9 @@ def remembered(find: Find) -> Find:
             return find(image, number)
         # Words are compared many times as fast as bytes.
         words = image if image.shape[-1] % WORD else as_words(image)
-        if last is not None and last[0] == number and torch.equal(last[1], words):
-            return last[2]
+        kept = last  # another thread may look at other images meanwhile
+        if kept is not None and kept[0] == number and torch.equal(kept[1], words):
+            return kept[2]
         found = find(image, number)
         if image.nbytes <= MOST_REMEMBERED:
             last = number, words.clone(), found

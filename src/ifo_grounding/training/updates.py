@@ -68,8 +68,10 @@ def update(
 
 
 def means(updates: list[dict[str, Tensor]]) -> dict[str, float]:
-    """Return the mean of each metric over some updates."""
-    return {key: float(torch.stack([each[key] for each in updates]).mean()) for key in updates[0]}
+    """Return the mean of each metric over those of some updates that have it."""
+    names = dict.fromkeys(name for each in updates for name in each)
+    found = {name: [each[name] for each in updates if name in each] for name in names}
+    return {name: float(torch.stack(values).mean()) for name, values in found.items()}
 
 
 class CapturedUpdate:

@@ -180,4 +180,6 @@ class InstructionSampler(InstructionTransform):
                 "select states with PoolScorer.choose first, or lower threshold"
             )
         chosen = self.tokens.to(index.device)[index]
-        return tensordict.set(self.out_keys[0], chosen.reshape(*tensordict.batch_size, -1))
+        shape = (*tensordict.batch_size, chosen.shape[-1])
+        # A full buffer may hand out its storage, which keeps what it holds.
+        return tensordict.copy().set(self.out_keys[0], chosen.reshape(shape))

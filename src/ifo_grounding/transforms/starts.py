@@ -123,8 +123,8 @@ class StartingPairs(InstructionTransform):
             if wrong.any():
                 raise UserError(
                     f"scene {int(self.scenes[pairs[wrong][0]])} is not the one that its pair was "
-                    "stored with: make the environment with the task, seed, stream, layout and "
-                    "tile size that select_pairs was given"
+                    "stored with: make the environment with the task, seed, stream, layout, "
+                    "tile size and codes that select_pairs was given"
                 )
         instruction = self.tokens[self._current].reshape(*tensordict_reset.batch_size, -1)
         return tensordict_reset.set(self.out_keys[0], instruction)

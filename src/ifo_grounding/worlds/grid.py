@@ -26,6 +26,11 @@ from ifo_grounding.worlds.base import World
 class Tiled(World):
     """A world of which the simulator can show numbers of tiles in place of pixels."""
 
+    def __init_subclass__(cls) -> None:
+        """Let a simulator that a subclass has changed show pixels, which may be other ones."""
+        if Tiled not in cls.__bases__ and "simulator" in vars(cls) and "coded" not in vars(cls):
+            cls.coded, cls.tiles = World.coded, None  # type: ignore[method-assign,assignment]
+
     @abstractmethod
     def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions and true rewards; see :class:`World`."""
