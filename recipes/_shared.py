@@ -164,8 +164,8 @@ def build(make: Any, options: Options, **kwargs: Any) -> Any:
     world = world_of(options)
     if network.network_config.shapes.fit(world.vocabulary):
         network.vocabulary = world.vocabulary
-    if world.tiles is not None:
-        networks.read_codes(network, world.tiles)
+    if (tiles := world.tiles) is not None:
+        networks.read_codes(network, tiles)
     return network
 
 

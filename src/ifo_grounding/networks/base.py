@@ -92,8 +92,8 @@ def read_codes(module: nn.Module, tiles: Tensor) -> None:
     >>> from ifo_grounding.networks import from_pretrained, read_codes
     >>> policy, env = from_pretrained("ifo-grounding/move"), PickAndPlaceEnv(codes=True)
     >>> read_codes(policy, env.tiles)
-    >>> env.rollout(5, policy)["pixels"].shape
-    torch.Size([1, 5, 6, 6])
+    >>> policy(env.reset())["logits"].shape
+    torch.Size([1, 6])
     """
     check_tiles(tiles)
     parts = [part for part in module.modules() if isinstance(part, ImageNetwork)]
