@@ -198,17 +198,17 @@ def of_methods(
         {"task": task, "preset": preset, "seed": seed, "demonstrations": {"n": n}},
         options.method,
     ]
-    methods = [method for method in METHODS if method != "lc-rl" or task in PLANNED]
+    left_out = () if task in PLANNED else ("lc-rl",)
     if not options.tune:
-        for method in methods:
+        for method in (method for method in METHODS if method not in left_out):
             file = f"baselines/{name}-{method}-seed{seed}.json"
             run = f"baselines-{name}-seed{seed}"
             yield replace(
                 call(options, run, [*chosen, {"method": method}], file, None), recipe="baselines"
             )
         return
-    for method in (method for method in methods if method in options.tuning):
-        space = options.tuning[method]
+    spaces = {method: of for method, of in options.tuning.items() if method not in left_out}
+    for method, space in spaces.items():
         for number, values in enumerate(product(*space.values())):
             trial = dict(zip(space, values, strict=True))
             of_trial = {"method": method, "variant": f"trial{number}"}

@@ -70,8 +70,8 @@ def expected_minutes(options: Options) -> float:
     seconds += goal.steps * goal.batch_size * (1 + goal.negatives) * 4e-5
     practised = options.self_examine
     seconds += practised.iterations * practised.num_envs * practised.steps * 3e-4
-    told_of = min(told.candidates, options.demonstrations.n)
-    seconds += 10 * (practised.pairs or 0) * told_of * 8e-6  # where one state in ten gets a pair
+    searched = 10 * (practised.pairs or 0) * min(told.candidates, options.demonstrations.n)
+    seconds += searched * 8e-6  # where one state in ten gets a pair
     seconds += options.evaluate.episodes * 8e-3
     return (20 + seconds * (4 if options.preset == "paper" else 1)) / 60
 

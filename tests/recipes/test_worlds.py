@@ -15,7 +15,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
 from ifo_grounding.playground import Lesson
-from ifo_grounding.worlds import Grid, OpenGrid
+from ifo_grounding.worlds import Grid, OpenGrid, World
 
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
 
@@ -66,12 +66,9 @@ class Dimmed(Grid):
 
 
 class Tiled(Grid):
-    """One that shows numbers of tiles by a transform of its own."""
+    """One that shows pixels, of which it names the tiles."""
 
-    tiles = PickAndPlaceEnv(codes=True).tiles
-
-    def coded(self, num_envs, **options):
-        return TransformedEnv(PickAndPlaceEnv(self.task, num_envs, instructed=False, codes=True))
+    tiles, coded = PickAndPlaceEnv(codes=True).tiles, World.coded
 
 
 def test_own_grids_show_pixels_or_the_codes_that_they_say(options):
@@ -82,9 +79,10 @@ def test_own_grids_show_pixels_or_the_codes_that_they_say(options):
     assert Dimmed("move").tiles is None and Grid("move").tiles is not None
     given = options("world=own", f"world._target_={__name__}.Tiled", "+world.task=move")
     policy = build(networks.make_policy, given)
-    seen = world_of(given).coded(2, seed=0).reset()
-    seen["instruction"] = torch.ones(2, 16).long()
-    assert seen["pixels"].dtype == torch.int16 and policy(seen)["logits"].isfinite().all()
+    shown = [each.coded(2, seed=0).reset() for each in (world_of(given), Grid("move"))]
+    assert [seen["pixels"].dtype for seen in shown] == [torch.uint8, torch.int16]
+    read = [policy(seen.set("instruction", torch.ones(2, 16).long()))["logits"] for seen in shown]
+    torch.testing.assert_close(*read)
 
 
 def test_a_world_without_a_stop_is_imitated_in(options, dial, capsys):

@@ -183,7 +183,7 @@ class Adversary(AdversarialUpdates):
         check_access(self, seen, self.access)
         self.stop_action = stop_action
         self.network = self.discriminator(shapes or frames_of(seen), preset, **options)
-        self.reward = self.paid(stop_action)
+        self.reward = self.paid()
         loss = DiscriminatorLoss(self.network, spare=self.spare, swapped=swapped)
         super().__init__(loss, self.demonstrated(seen), steps, lr, batch_size)
 
@@ -195,7 +195,7 @@ class Adversary(AdversarialUpdates):
         """Return the network."""
         raise NotImplementedError
 
-    def paid(self, stop_action: int | None) -> DiscriminatorReward:
+    def paid(self) -> DiscriminatorReward:
         """Return the transform that pays."""
         return DiscriminatorReward(self.network)
 
@@ -284,12 +284,12 @@ class AGILE(Adversary):
         in_keys = (AFTER, keys.INSTRUCTION)
         return make_instruction_classifier(shapes, preset, in_keys=in_keys, **options)
 
-    def paid(self, stop_action: int | None) -> DiscriminatorReward:  # noqa: D102
-        if stop_action is None:
+    def paid(self) -> DiscriminatorReward:  # noqa: D102
+        if self.stop_action is None:
             raise UserError(
                 "AGILE is paid at the stop, and this world has none: give world.stop=add"
             )
-        return DiscriminatorReward(self.network, at_stop=stop_action)
+        return DiscriminatorReward(self.network, at_stop=self.stop_action)
 
 
 class ChosenAGILE(AGILE):
