@@ -30,9 +30,8 @@ def attribute(source: Any, name: str, default: Any = None) -> Any:
 
 def innermost(env: Any) -> Any:
     """Return the environment that all transforms and all batches of workers are around."""
-    while isinstance(env, (TransformedEnv, BatchedEnvBase)):
-        env = env.base_env if isinstance(env, TransformedEnv) else first_worker(env)
-    return env
+    env = untransformed(env)
+    return innermost(first_worker(env)) if isinstance(env, BatchedEnvBase) else env
 
 
 def untransformed(env: EnvBase) -> EnvBase:

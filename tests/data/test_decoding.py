@@ -47,11 +47,11 @@ def test_codes_of_a_simulator_come_out_where_it_has_all_tiles():
 
 
 def test_entries_can_be_rows_of_shared_frames():
-    rows, shown = ["row", ("next", "row")], ["seen", ("next", "seen")]
+    shown = ["seen", ("next", "seen")]
     names = torch.arange(80, dtype=torch.int16).view(40, 2)
-    lookups = Lookup(names, ["row"], ["name"]), Lookup(CODES, rows, shown)
+    lookups = Lookup(names, ["name"]), Lookup(CODES, shown)
     row = torch.arange(39, dtype=torch.int32)
-    entries = TensorDict({"row": row, "next": {"row": row + 1}}, [39])
+    entries = TensorDict({"name": row, "seen": row, "next": {"seen": row + 1}}, [39])
     sample = Compose(*lookups, FrameDecoder(CODEC, shown))(entries)
     assert torch.equal(sample["seen"], FRAMES[:-1])
     assert torch.equal(sample["next", "seen"], FRAMES[1:])

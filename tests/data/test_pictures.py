@@ -100,9 +100,10 @@ def test_frames_that_cannot_be_written_are_refused(kind, shape, said, tmp_path):
 def test_what_is_there_is_not_replaced_and_what_has_no_instruction_not_written(demos, tmp_path):
     save_pictures(demos[:1], tmp_path)
     before = sorted(tmp_path.rglob("*"))
-    for folder in (tmp_path, tmp_path / "episodes.jsonl"):
-        with pytest.raises(UserError, match="exists and is no empty folder: name another one"):
-            save_pictures(demos, folder)
+    with pytest.raises(UserError, match="holds '0', which would be deleted: name another folder"):
+        save_pictures(demos, tmp_path)
+    with pytest.raises(UserError, match="is a file: name a folder"):
+        save_pictures(demos, tmp_path / "episodes.jsonl")
     frames = [torch.zeros(2, 3, 8, 8, dtype=torch.uint8)] * 2
     tokens, words = torch.tensor([[1], [0]]), Vocabulary(["up"], length=1)
     silent = Demonstrations.from_arrays(frames, tokens, vocabulary=words)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import struct
 from collections.abc import Iterable, Iterator
 from io import BytesIO
@@ -84,16 +83,13 @@ def _pixels(source: object, mode: str, size: tuple[int, int] | None) -> np.ndarr
     """Return an image as it is shown, uint8 [H, W] or [H, W, C]."""
     if not isinstance(source, Source):
         raise TypeError(f"{source!r:.40} is no picture")
-    opened = (
-        contextlib.nullcontext(source) if isinstance(source, Image.Image) else open_image(source)
-    )
-    with opened as image:
-        if image.mode in NOT_BYTES:
-            raise ValueError(f"it has numbers of mode {image.mode!r}: save 8 bits per colour")
-        if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
-            image = ImageOps.exif_transpose(image)
-        image = image.convert(mode)
-        return np.asarray(image.resize(size[::-1]) if size else image)
+    image = source if isinstance(source, Image.Image) else open_image(source)
+    if image.mode in NOT_BYTES:
+        raise ValueError(f"it has numbers of mode {image.mode!r}: save 8 bits per colour")
+    if image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
+        image = ImageOps.exif_transpose(image)
+    image = image.convert(mode)
+    return np.asarray(image.resize(size[::-1]) if size else image)
 
 
 def animation_frames(path: Path) -> Iterator[Image.Image]:

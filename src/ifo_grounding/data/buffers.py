@@ -66,11 +66,10 @@ def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer
     episode, frame = rows_of(demos.starts, demos.lengths)
     last = demos.starts + demos.lengths - 1
     earlier = ~same_rows(demos.codes, frame, last[episode])
-    balance = torch.zeros(len(demos), dtype=torch.int64).scatter_add_(0, episode, earlier.long())
+    balance = episode[earlier].bincount(minlength=len(demos))
     finished = torch.arange(len(demos)).repeat_interleave(balance.clamp(min=1) * closed)
     episodes = torch.cat([episode[earlier], finished])
-    final = torch.zeros(len(episodes), 1, dtype=torch.bool)
-    final[int(earlier.sum()) :] = True
+    final = torch.arange(len(episodes)).unsqueeze(-1) >= earlier.sum()
     stored = {
         keys.INITIAL_PIXELS: demos.starts[episodes],
         keys.PIXELS: torch.cat([frame[earlier], last[finished]]),

@@ -65,8 +65,7 @@ class FrameCodec:
                     "of 8 and a divisor of height and width"
                 )
             self.words = mosaic.as_words(tiles.cpu())
-            rows = enumerate(self.words.numpy())
-            self._numbers = {row.tobytes(): number for number, row in rows}
+            self._numbers = {tile.tobytes(): n for n, tile in enumerate(self.words.numpy())}
             if len(self._numbers) != len(tiles):
                 raise UserError("tiles are not distinct: give each tile once")
 
@@ -86,7 +85,8 @@ class FrameCodec:
     @property
     def code_dtype(self) -> torch.dtype:
         """Smallest integer type that holds every tile number."""
-        return torch.uint8 if self.words is None else smallest_dtype(len(self.words))
+        largest = 0 if self.words is None else len(self.words) - 1
+        return next(dtype for dtype in CODE_DTYPES if largest <= torch.iinfo(dtype).max)
 
     def __repr__(self) -> str:
         kind = "raw" if self.words is None else f"{len(self.words)} tiles of {self.tile_size}"
@@ -174,10 +174,9 @@ class FrameCodec:
 
         None where one is none of them, uint8 [N, C, T, T], or the codec is raw.
         """
-        if self.words is None or tiles.shape[1:] != self.words.view(torch.uint8).shape[1:]:
+        if self.tiles is None or tiles.shape[1:] != self.tiles.shape[1:]:
             return None
-        rows = enumerate(mosaic.as_words(tiles.cpu()).numpy())
-        known = {row.tobytes(): number for number, row in rows}
+        known = {tile.tobytes(): number for number, tile in enumerate(tiles.cpu().numpy())}
         found = [known.get(tile, -1) for tile in self._numbers]  # in the order of their numbers
         return None if -1 in found else torch.tensor(found, dtype=torch.int16)
 
@@ -257,11 +256,6 @@ def _cut(frames: Tensor, tile_size: int) -> Tensor:
     return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)
 
 
-def smallest_dtype(count: int) -> torch.dtype:
-    """Return the smallest of uint8, int16 and int32 that holds ``0 .. count - 1``."""
-    return next(dtype for dtype in CODE_DTYPES if count - 1 <= torch.iinfo(dtype).max)
-
-
 def _checked(frames: Tensor) -> Tensor:
     if not isinstance(frames, Tensor) or frames.dtype != torch.uint8 or frames.ndim != 4:
         kind = getattr(frames, "dtype", type(frames).__name__)
@@ -274,13 +268,11 @@ def _tile_size(frames: Tensor, asked: int | None) -> int | None:
     """Return the tile size that seems cheapest on a sample of the frames; None where none fits."""
     height, width = frames.shape[-2:]
     fitting = [size for size in TILE_SIZES if height % size == 0 and width % size == 0 and height]
-    if asked is not None:
-        if asked not in fitting:
-            raise UserError(
-                f"tile size {asked} does not divide images of {height} x {width} pixels: "
-                f"choose one of {fitting}, or none for pixels as they are"
-            )
-        return asked
+    if asked is not None and asked not in fitting:
+        raise UserError(
+            f"tile size {asked} does not divide images of {height} x {width} pixels: "
+            f"choose one of {fitting}, or none for pixels as they are"
+        )
     sample = frames[:: max(1, -(-len(frames) // SAMPLE_FRAMES))]
 
     def cost(size: int) -> float:
@@ -288,4 +280,4 @@ def _tile_size(frames: Tensor, asked: int | None) -> int | None:
         codec._encode(sample)
         return codec._share(len(frames))
 
-    return min(fitting, key=cost, default=None)
+    return asked or min(fitting, key=cost, default=None)

@@ -22,8 +22,7 @@ class Lookup(Transform):
 
     Args:
         table: [N, *S].
-        in_keys: entries with row numbers, integer [*B].
-        out_keys: where the rows go, [*B, *S]; by default the same entries.
+        in_keys: entries with row numbers, integer [*B], in whose place come the rows, [*B, *S].
 
     >>> import torch
     >>> from tensordict import TensorDict
@@ -35,13 +34,8 @@ class Lookup(Transform):
     table: Any
     """[N, *S]; None where what a decoder reads are the pixels."""
 
-    def __init__(
-        self,
-        table: Tensor | None,
-        in_keys: Sequence[NestedKey],
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
-        super().__init__(in_keys=[*in_keys], out_keys=[*(out_keys or in_keys)])
+    def __init__(self, table: Tensor | None, in_keys: Sequence[NestedKey]) -> None:
+        super().__init__(in_keys=[*in_keys], out_keys=[*in_keys])
         self.register_buffer("table", table, persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -74,13 +68,8 @@ class FrameDecoder(Lookup):
     (torch.Size([10, 6, 6]), torch.Size([4, 3, 48, 48]))
     """
 
-    def __init__(
-        self,
-        codec: FrameCodec,
-        in_keys: Sequence[NestedKey] = FRAME_KEYS,
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
-        super().__init__(codec.words, in_keys, out_keys)
+    def __init__(self, codec: FrameCodec, in_keys: Sequence[NestedKey] = FRAME_KEYS) -> None:
+        super().__init__(codec.words, in_keys)
         self.codec = codec
 
     def show_codes(self, tiles: Tensor) -> None:

@@ -34,8 +34,7 @@ def save_folder(
         UserError: where the folder is a file, or holds what is not of this kind, which would be
             deleted.
     """
-    _check_ours(Path(folder), kind)
-    with atomic_write(folder) as temporary:
+    with atomic_write(vacant(folder, kind)) as temporary:
         temporary.mkdir()
         listed = {}
         for name, tensor in arrays.items():
@@ -47,11 +46,13 @@ def save_folder(
         write_json(temporary / META, meta)
 
 
-def _check_ours(folder: Path, kind: str) -> None:
+def vacant(folder: str | Path, kind: str | None = None) -> Path:
+    """Return a folder that is written next; refuse one that holds more than this kind."""
+    folder = Path(folder)
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file: name a folder")
     ours: set[str] = set()
-    if (folder / META).exists():
+    if kind is not None and (folder / META).exists():
         meta = read_json(folder / META)
         if isinstance(meta, dict) and meta.get("format") == kind:
             ours = {META, *(f"{name}.npy" for name in meta.get("arrays") or ())}
@@ -60,6 +61,7 @@ def _check_ours(folder: Path, kind: str) -> None:
             f"{folder} holds {others[0]!r}, which would be deleted: name another folder, or an "
             "empty one"
         )
+    return folder
 
 
 def load_folder(
@@ -75,9 +77,8 @@ def load_folder(
     folder = Path(folder)
     if not (folder / META).is_file():
         raise UserError(f"{folder} is not a folder of {kind}: it has no {META}")
-    meta = read_json(folder / META)
-    found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
-    if found != kind:
+    meta = read_json(folder / META, dict)
+    if (found := meta.get("format")) != kind:
         raise UserError(f"{folder} holds {found!r}, not {kind!r}")
     if meta.get("version") != VERSION:
         raise UserError(

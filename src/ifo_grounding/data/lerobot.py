@@ -15,8 +15,8 @@ from ifo_grounding.data._episodes import Episode, naming, open_table, read_table
 from ifo_grounding.data._images import Source, stack_images
 from ifo_grounding.data._video import read_video
 from ifo_grounding.data.demonstrations import Demonstrations
-from ifo_grounding.data.folder import DAMAGED
-from ifo_grounding.data.pictures import TRUNCATED, new_folder, rgb, written_sentences
+from ifo_grounding.data.folder import DAMAGED, vacant
+from ifo_grounding.data.pictures import TRUNCATED, rgb, written_sentences
 from ifo_grounding.errors import UserError, at_least_one, optional
 from ifo_grounding.files import atomic_write, read_json, write_json
 from ifo_grounding.progress import progress_bar
@@ -147,7 +147,7 @@ def save_lerobot(demos: Demonstrations, folder: str | Path) -> None:
     episodes = {"episode_index": numbers, "tasks": [[said] for said in sentences]}
     episodes |= {"length": lengths, "dataset_from_index": ends - lengths, "dataset_to_index": ends}
     episodes |= {"data/chunk_index": numbers // 1000, "data/file_index": numbers % 1000}
-    with atomic_write(new_folder(folder)) as temporary:
+    with atomic_write(vacant(folder)) as temporary:
 
         def write(name: str, rows: dict[str, Any], index: Any = None) -> None:
             path = temporary / f"{name}.parquet"

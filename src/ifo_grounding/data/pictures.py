@@ -18,6 +18,7 @@ from ifo_grounding.data._images import MODES, SUFFIXES, Source, animation_frames
 from ifo_grounding.data._video import read_video, write_video
 from ifo_grounding.data.buffers import check_demonstrations
 from ifo_grounding.data.demonstrations import Demonstrations
+from ifo_grounding.data.folder import vacant
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.files import atomic_write
 from ifo_grounding.progress import progress_bar
@@ -199,7 +200,7 @@ def save_pictures(
     scale = at_least_one("scale", scale)
     sentences = written_sentences(demos, tuple(MODES) if kind == "png" else COLOURS)
     digits = len(str(len(demos) - 1))
-    with atomic_write(new_folder(folder)) as temporary:
+    with atomic_write(vacant(folder)) as temporary:
         temporary.mkdir()
         lines = []
         for number, (sentence, cut) in enumerate(zip(sentences, demos.cut.tolist(), strict=True)):
@@ -219,16 +220,6 @@ def save_pictures(
             for step, frame in enumerate(frames):
                 Image.fromarray(frame).save(temporary / name / f"{step:04d}.png")
         (temporary / LIST).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def new_folder(folder: str | Path) -> Path:
-    """Return a folder that is written next; refuse one that holds something."""
-    folder = Path(folder)
-    if folder.is_file() or any(folder.glob("*")):
-        raise UserError(
-            f"{folder} exists and is no empty folder: name another one, or remove it first"
-        )
-    return folder
 
 
 def written_sentences(demos: Demonstrations, colours: tuple[int, ...] = COLOURS) -> list[str]:

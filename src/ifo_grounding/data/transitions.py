@@ -32,15 +32,9 @@ BATCH_FRAMES = 2048
 
 
 class RandomActions(TensorDictModuleBase):
-    """A policy that draws actions with fixed probabilities, by its own generator.
+    """A policy that draws actions as :func:`collect_transitions` says, by its own generator.
 
-    Args:
-        stop_probability: probability of ``stop_action``; the others share the rest evenly. By
-            default all are equally likely.
-        stop_action: by default that of the environment; none where it does not say.
-
-    Raises:
-        UserError: where the actions are not categorical, or the stop is not one of them.
+    Those other than the stop are equally likely.
 
     >>> from ifo_grounding.envs import PickAndPlaceEnv
     >>> env = PickAndPlaceEnv("move", num_envs=3, seed=0)
