@@ -28,7 +28,7 @@ from _shared import (
     write_result,
 )
 from evaluate import measured_success, played, success_results
-from imitate import imitate_transitions, split_transitions
+from imitate import imitate_transitions, new_policy, split_transitions
 from self_examine import chosen_starts
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import RandomPolicy
@@ -53,7 +53,7 @@ from ifo_grounding.config import STAGES, Options
 from ifo_grounding.data import Collected, Truth, label_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import success_rate
-from ifo_grounding.networks import make_policy, make_value
+from ifo_grounding.networks import make_value
 from ifo_grounding.objectives import InverseLoss
 from ifo_grounding.report.results import by_scene
 from ifo_grounding.training import Run, Stage, fit, improve_policy
@@ -221,9 +221,8 @@ def adversarial(options: Options) -> Run:
         return stage.run
     run, world = stage.run, world_of(options)
     begun = load_network(run, REFERENCE, "baselines", options) if method == "gail+bc" else None
-    context = options.imitate.context
-    policy = build(make_policy, options, context=context) if begun is None else begun
-    value = build(make_value, options, init_from=policy, context=context)
+    policy = new_policy(options, options.seed) if begun is None else begun
+    value = build(make_value, options, init_from=policy)
     seen, more = access(options, run), options.networks.changed()
     if method == "gaifo":
         more["inverse"] = load_network(run, INVERSE, "train_inverse", options)

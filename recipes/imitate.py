@@ -16,6 +16,7 @@ from _shared import (
 )
 from torch import Tensor
 from torchrl.data import ReplayBuffer
+from torchrl.modules import ProbabilisticActor
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
@@ -51,12 +52,7 @@ def imitate_transitions(
     read_fast(seen, options)
 
     def trial(number: int) -> Trial:
-        policy = build(
-            make_policy,
-            options,
-            seed=trial_seed(options.seed, number),
-            context=section.context,
-        )
+        policy = new_policy(options, trial_seed(options.seed, number))
         loss = ImitationLoss(policy, words_from=section.words_from)
         stopping = EarlyStopping(loss, held_out) if held_out is not None else None
         checkpoint = stage.trial(number)
@@ -73,6 +69,11 @@ def imitate_transitions(
     trials = [trial(number) for number in range(section.trials)]
     best = successive_halving(trials, section.trial_steps, section.trial_halvings)
     return keep(options, stage, best, file, **found)
+
+
+def new_policy(options: Options, seed: int) -> ProbabilisticActor:
+    """Build a policy that sees as many neighbouring cells as the options say."""
+    return build(make_policy, options, seed=seed, context=options.imitate.context)
 
 
 def labelled_demonstrations(run: Run, share: float) -> tuple[ReplayBuffer, ReplayBuffer | None]:

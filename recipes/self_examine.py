@@ -52,7 +52,7 @@ def examine(options: Options) -> dict:
     run = stage.run
     # What is trained: the policy of phase 1, and a critic that begins with its weights.
     policy = load_network(run, POLICIES["phase1"], "imitate", options)
-    value = build(make_value, options, init_from=policy, context=options.imitate.context)
+    value = build(make_value, options, init_from=policy)
     # Where: states of the simulator with chosen instructions, paid by what was learned.
     reward = learned_reward(run, options)
     env = paid_simulator(reward, run, options)

@@ -50,18 +50,10 @@ def losses(
     """Return the loss of each trial: the last one begins without the policy's roles of words."""
     section, pool = options.instruction, demos.pool()
     policy = starting_policy(run, options, section.warm_start)
-    context = options.imitate.context if policy is not None else 0
     likely = [(True, trial_seed(options.seed, number)) for number in range(section.trials - 1)]
     return [
         InstructionLoss(
-            build(
-                make_instruction_classifier,
-                options,
-                init_from=policy,
-                roles=roles,
-                context=context,
-                seed=seed,
-            ),
+            build(make_instruction_classifier, options, init_from=policy, roles=roles, seed=seed),
             pool,
             negatives=section.negatives,
             removal_rate=section.removal_rate,

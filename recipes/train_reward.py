@@ -24,8 +24,7 @@ def train_reward(options: Options) -> dict:
         return stage.result
     buffer = labelled_buffer(load_demonstrations(stage.run), load_labels(stage.run))
     policy = starting_policy(stage.run, options, section.warm_start)
-    context = options.imitate.context if section.warm_start else 0
-    network = build(make_reward_model, options, init_from=policy, context=context)
+    network = build(make_reward_model, options, init_from=policy)
     return learn(options, stage, RewardLoss(network), buffer, section, REWARD)
 
 

@@ -23,26 +23,22 @@ TURNS = threading.RLock()
 
 
 @contextlib.contextmanager
-def in_mode(training: bool, *modules: object) -> Iterator[None]:
-    """Run a block with modules in train or eval mode; every submodule gets its own mode back."""
-    parts = [part for m in modules if isinstance(m, nn.Module) for part in m.modules()]
+def in_mode(training: bool, module: object) -> Iterator[None]:
+    """Run a block with a module in train or eval mode; every submodule gets its own mode back."""
+    parts = module.modules() if isinstance(module, nn.Module) else ()
     with TURNS:
-        before = [part.training for part in parts]
+        switched = [part for part in parts if part.training is not training]
         try:
-            _set_modes(parts, [training] * len(parts))
+            for part in switched:
+                part.training = training
             yield
         finally:
-            _set_modes(parts, before)
-
-
-def _set_modes(parts: list[nn.Module], modes: list[bool]) -> None:
-    for part, mode in zip(parts, modes, strict=True):
-        if part.training is not mode:  # to set an attribute of a module is slow
-            part.training = mode
+            for part in switched:
+                part.training = not training
 
 
 @contextlib.contextmanager
-def evaluating(*modules: object) -> Iterator[None]:
+def evaluating(module: object) -> Iterator[None]:
     """Run a block without gradients and in eval mode; every submodule gets its own mode back.
 
     >>> network = nn.Sequential(nn.Dropout(), nn.Linear(1, 1).eval())
@@ -52,7 +48,7 @@ def evaluating(*modules: object) -> Iterator[None]:
     >>> [part.training for part in network]
     [True, False]
     """
-    with in_mode(False, *modules), torch.no_grad():
+    with in_mode(False, module), torch.no_grad():
         yield
 
 

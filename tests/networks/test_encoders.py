@@ -67,19 +67,21 @@ def test_images_that_do_not_repeat_take_the_plain_way(image):
     assert ConvEncoder(3, 8, 4)(image).shape == (len(image), 8, 3, 3)
 
 
-def test_patch_encoder_is_a_strided_convolution():
+def test_patch_encoder_is_a_strided_convolution_of_two_images_and_their_difference():
     torch.manual_seed(0)
     encoder = PatchEncoder(3, 16, patch=8)
-    pixels = torch.randint(256, (4, 3, 40, 56), dtype=torch.uint8)
-    kernel = encoder.embed.weight.reshape(16, 3, 8, 8)
-    convolved = nn.functional.conv2d(pixels / 255, kernel, encoder.embed.bias, stride=8)
-    torch.testing.assert_close(encoder(pixels), convolved)
+    both = torch.randint(256, (4, 6, 40, 56), dtype=torch.uint8)
+    change = (both[:, :3].int() - both[:, 3:].int()).abs()
+    kernel = encoder.embed.weight.reshape(16, 9, 8, 8)
+    pixels = torch.cat([both, change], 1) / 255
+    convolved = nn.functional.conv2d(pixels, kernel, encoder.embed.bias, stride=8)
+    torch.testing.assert_close(encoder(both), convolved)
 
 
 def test_patches_of_a_ragged_image_are_padded_with_black():
     encoder = PatchEncoder(3, 16, patch=8)
-    ragged = torch.randint(256, (1, 3, 9, 15), dtype=torch.uint8)
-    padded = torch.zeros(1, 3, 16, 16, dtype=torch.uint8)
+    ragged = torch.randint(256, (1, 6, 9, 15), dtype=torch.uint8)
+    padded = torch.zeros(1, 6, 16, 16, dtype=torch.uint8)
     padded[..., :9, :15] = ragged
     torch.testing.assert_close(encoder(ragged), encoder(padded))
 
@@ -98,9 +100,9 @@ def test_other_numbers_are_no_images(dtype, value, said):
         policy(pixels=pixels, instruction=torch.ones(2, 16).long())
 
 
-@pytest.mark.parametrize("make", [lambda: ConvEncoder(3, 8, 4), lambda: PatchEncoder(3, 8, 8)])
+@pytest.mark.parametrize("make", [lambda: ConvEncoder(6, 8, 4), lambda: PatchEncoder(3, 8, 8)])
 def test_remembered_images_may_change_in_place_and_begin_anywhere_in_a_buffer(make):
-    encoder, images = make(), tiled(64)
+    encoder, images = make(), tiled(64, channels=6)
     before = encoder(images)
     buffer = torch.cat([torch.zeros(3, dtype=torch.uint8), images.flatten()])
     torch.testing.assert_close(encoder(buffer[3:].view_as(images)), before)

@@ -33,6 +33,16 @@ def test_a_network_inherits_and_goes_its_own_way(shapes, preset, make):
 
 
 @pytest.mark.parametrize("make", EVERY)
+def test_a_network_sees_as_far_as_the_policy_that_it_begins_with(shapes, make):
+    policy = networks.make_policy(shapes, context=2, seed=0)
+    assert make(shapes, init_from=policy).network_config.config.context == 2
+    assert make(shapes).network_config.config.context == 0
+    if make not in SCORERS:  # which always see one cell around
+        with pytest.raises(UserError, match="init_from does not fit"):
+            make(shapes, context=1, init_from=policy)
+
+
+@pytest.mark.parametrize("make", EVERY)
 def test_what_does_not_fit_is_refused(shapes, make):
     for options in ({"preset": "paper"}, {"features": 32}):
         with pytest.raises(UserError, match=r"init_from does not fit.*same preset, sizes"):

@@ -1,14 +1,14 @@
 """The networks, each a TensorDictModule built for the sizes of a world.
 
-All ``make_*`` functions take an ``spec_source`` (an env, a dataset or :class:`Shapes`), a
+All ``make_*`` functions take a ``spec_source`` (an env, a dataset or :class:`Shapes`), a
 ``preset`` (``"strong"`` or ``"paper"``), names of entries (``in_keys``, ``out_key``), a ``device``,
 a ``seed`` that alone decides the initial weights, and values of :class:`NetworkConfig` to replace;
 where they take ``init_from``, a policy of the same preset and sizes, whose weights are copied (a
-warm start). What they read are images, uint8 [*B, C, H, W], instructions, int64 [*B, L], and
-actions, integer [*B]. They raise :class:`~ifo_grounding.errors.UserError` for an unknown preset or
-option, for sizes that cannot be read, and for a policy that does not fit. What they return is in
-eval mode, in which to collect and to evaluate; the supervised losses switch to train mode while
-they compute.
+warm start) and whose ``context`` they have. What they read are images, uint8 [*B, C, H, W],
+instructions, int64 [*B, L], and actions, integer [*B]. They raise
+:class:`~ifo_grounding.errors.UserError` for an unknown preset or option, for sizes that cannot be
+read, and for a policy that does not fit. What they return is in eval mode, in which to collect and
+to evaluate; the supervised losses switch to train mode while they compute.
 """
 
 from ifo_grounding.networks.base import read_codes

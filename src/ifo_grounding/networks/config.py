@@ -61,7 +61,8 @@ class NetworkConfig:
     context: int = 0
     """Layers that let a cell see its neighbours (``strong``): residual blocks of the inverse model;
     in policy, critic and reward model convolutions over forms and word maps, with which places are
-    also read relative to what is seen. The classifiers always see one cell around."""
+    also read relative to what is seen. The classifiers always see one cell around. What begins with
+    a policy's weights has the policy's."""
     heads: int = 8
     """Attention maps that read no words (``strong``)."""
     values: int = 16
@@ -129,10 +130,7 @@ class NetworksConfig:
     """States of the GRU that make an encoded sentence: ``mean`` or ``last`` (``paper``)."""
 
     def __post_init__(self) -> None:
-        check_range(self, "features", least=1, most=4096)
-        check_range(self, "dropout", least=0, most=0.999)
-        check_range(self, "sentence_rate", above=0, most=1000)
-        check_choice("sentence_pooling", self.sentence_pooling, (None, "last", "mean"))
+        NetworkConfig.of("policy", "paper", **self.changed())  # which has them all
 
     def changed(self) -> dict[str, Any]:
         """Return the values that are not the preset's."""

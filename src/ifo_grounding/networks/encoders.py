@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -63,37 +61,33 @@ def _on_blocks(layer: nn.Conv2d, seen: Tensor) -> Tensor:
 
 
 class PatchEncoder(nn.Module):
-    """One feature vector per patch, the same wherever the patch lies.
+    """One feature vector per patch of two images and of how far each pixel changed between them.
 
-    A strided convolution, as a linear layer of distinct patches: bytes are cheaper to rearrange
-    than floats, and the layout fits the convolutions that follow.
+    It is the same wherever the patch lies: a strided convolution, as a linear layer of distinct
+    patches. Bytes are cheaper to rearrange than floats, and the layout fits the convolutions that
+    follow.
 
     Args:
-        channels: what :attr:`complete` makes of an image's channels.
+        channels: those of one image.
         patch: pixels along one side of a patch.
-        complete: makes what is embedded of patches [U, C, P * P]; by default they are as they are.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        features: int,
-        patch: int,
-        complete: Callable[[Tensor], Tensor] | None = None,
-    ) -> None:
+    def __init__(self, channels: int, features: int, patch: int) -> None:
         super().__init__()
-        self.patch, self.complete = patch, complete or nn.Identity()
-        self.embed = nn.Linear(channels * patch**2, features)
+        self.patch = patch
+        self.embed = nn.Linear(3 * channels * patch**2, features)
 
-    def forward(self, image: Tensor) -> Tensor:
-        """Map an image [N, C, H, W] to features [N, F, h, w], channels last in memory."""
-        grid = -(-image.shape[-2] // self.patch), -(-image.shape[-1] // self.patch)
-        return self.look_up(*cells_of(image, self.patch), grid)
+    def forward(self, both: Tensor) -> Tensor:
+        """Map two images [N, 2 C, H, W] to features [N, F, h, w], channels last in memory."""
+        grid = -(-both.shape[-2] // self.patch), -(-both.shape[-1] // self.patch)
+        return self.look_up(*cells_of(both, self.patch), grid)
 
     def look_up(self, patches: Tensor, index: Tensor, grid: tuple[int, int]) -> Tensor:
-        """Embed distinct patches [U, C, P * P], and look up which lies where: [N, F, h, w].
+        """Embed distinct patches [U, 2 C, P * P], and look up which lies where: [N, F, h, w].
 
         ``index`` is int64 [N, h * w], ``grid`` h and w.
         """
-        pixels = as_float(self.complete(patches).flatten(1), self.embed.weight)
+        before, after = patches.chunk(2, 1)
+        change = torch.maximum(before, after) - torch.minimum(before, after)
+        pixels = as_float(torch.cat([patches, change], 1).flatten(1), self.embed.weight)
         return look_up(self.embed(pixels), index).unflatten(1, grid).movedim(-1, 1)

@@ -12,7 +12,7 @@ from ifo_grounding.networks.base import ImageNetwork, same_batch
 from ifo_grounding.networks.cells import distinct_pairs
 from ifo_grounding.networks.config import NetworkConfig
 from ifo_grounding.networks.encoders import ConvEncoder, PatchEncoder
-from ifo_grounding.networks.layers import ResidualBlock, flatten_cells, head, pool_cells
+from ifo_grounding.networks.layers import ResidualBlock, flatten_cells, head
 from ifo_grounding.networks.patches import Mosaics, as_pixels
 from ifo_grounding.networks.shapes import Shapes, patch_size
 
@@ -32,8 +32,7 @@ class InverseNetwork(ImageNetwork):
             self.image = ConvEncoder(2 * channels, features, config.conv_layers)
             size = features * math.prod(self.grid)
         else:
-            patch = patch_size(shapes, config)
-            self.image = PatchEncoder(3 * channels, features, patch, _with_change)
+            self.image = PatchEncoder(channels, features, patch_size(shapes, config))
             size = 2 * features
         self.blocks = nn.Sequential(*(ResidualBlock(features) for _ in range(config.context)))
         self.head = head(size, config, shapes.n_actions)
@@ -43,25 +42,22 @@ class InverseNetwork(ImageNetwork):
         before, batch = self.flat_pixels(pixels)
         after, next_batch = self.flat_pixels(next_pixels)
         same_batch(pixels=batch, next_pixels=next_batch)
-        if isinstance(before, Mosaics) and isinstance(after, Mosaics) and self._looks_up:
+        if (
+            isinstance(before, Mosaics)
+            and isinstance(after, Mosaics)
+            and not before.tiles.is_cuda  # which would have to be waited for
+            and self.reads_tiles(self.shapes.image_shape, before.tiles.shape[-1])
+        ):
             outputs = self.from_tiles(before.tiles, before.codes, after.codes)
         else:
             both = torch.cat([as_pixels(before), as_pixels(after)], -3)
             outputs = self._logits(self.image(both))
         return outputs.float().reshape(*batch, outputs.shape[-1])
 
-    @property
-    def _looks_up(self) -> bool:
-        """Whether codes are read by :meth:`from_tiles`, which a GPU would have to be waited for."""
-        if self.tiles is None or self.tiles.is_cuda:
-            return False
-        return self.reads_tiles(self.shapes.image_shape, self.tiles.shape[-1])
-
     def reads_tiles(self, image_shape: tuple[int, ...], tile_size: int | None) -> bool:
         """Whether :meth:`from_tiles` takes images of this shape made of tiles of this size."""
-        if not isinstance(self.image, PatchEncoder) or image_shape != self.shapes.image_shape:
-            return False
-        return self.image.patch == tile_size
+        fits = isinstance(self.image, PatchEncoder) and self.image.patch == tile_size
+        return fits and image_shape == self.shapes.image_shape
 
     def from_tiles(self, tiles: Tensor, before: Tensor, after: Tensor) -> Tensor:
         """Map the pictures that tiles make to logits, float32 [N, A], without making them.
@@ -81,11 +77,6 @@ class InverseNetwork(ImageNetwork):
     def _logits(self, encoded: Tensor) -> Tensor:
         """Map encoded images [N, F, h, w] to logits [N, A]."""
         features = F.relu(self.blocks(F.relu(encoded)))
-        paper = self.config.preset == "paper"
-        return self.head(flatten_cells(features) if paper else pool_cells(features))
-
-
-def _with_change(both: Tensor) -> Tensor:
-    """Lay on top of two images [N, 2 C, ...] how far each pixel changed: [N, 3 C, ...]."""
-    before, after = both.chunk(2, 1)
-    return torch.cat([both, torch.maximum(before, after) - torch.minimum(before, after)], 1)
+        if self.config.preset == "paper":
+            return self.head(flatten_cells(features))
+        return self.head(torch.cat([features.amax((-2, -1)), features.mean((-2, -1))], -1))

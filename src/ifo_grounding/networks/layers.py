@@ -61,11 +61,6 @@ class ResidualBlock(nn.Module):
         return image + self.look(F.relu(mixed))
 
 
-def pool_cells(image: Tensor) -> Tensor:
-    """Return the maximum and the mean over cells: [N, F, H, W] -> [N, 2 F]."""
-    return torch.cat([image.amax((-2, -1)), image.mean((-2, -1))], -1)
-
-
 def flatten_cells(features: Tensor) -> Tensor:
     """Flatten [N, F, h, w] to [N, h * w * F], the order in which it lies in memory."""
     return features.permute(0, 2, 3, 1).flatten(1)

@@ -23,7 +23,7 @@ from ifo_grounding.networks.config import INPUTS, NetworkConfig
 from ifo_grounding.networks.inverse import InverseNetwork
 from ifo_grounding.networks.scoring import GatedScorer, PairScorer
 from ifo_grounding.networks.shapes import Shapes, check_categorical, patch_size
-from ifo_grounding.networks.trunk import InstructedNetwork, RewardNetwork
+from ifo_grounding.networks.trunk import InstructedNetwork, RewardNetwork, instructed_network
 from ifo_grounding.networks.warm_start import started
 from ifo_grounding.networks.word_scoring import WordScorer
 
@@ -41,16 +41,33 @@ class Blueprint:
     """Keyword arguments of its ``make_*`` function: keys and the like."""
 
 
+def pair_scorer(shapes: Shapes, config: NetworkConfig, images: int = 1) -> PairScorer:
+    """Return the preset's network that scores ``images`` images with an instruction."""
+    kind = GatedScorer if config.preset == "paper" else WordScorer
+    return kind(shapes, config, images)
+
+
+NETWORKS: dict[str, Callable[[Shapes, NetworkConfig], nn.Module]] = {
+    "inverse": InverseNetwork,
+    "policy": InstructedNetwork,
+    "value": partial(InstructedNetwork, outputs=1),
+    "instruction": pair_scorer,
+    "reward": RewardNetwork,
+    "goal": partial(pair_scorer, images=2),
+}
+
+
 def build(
     kind: str,
-    network: Callable[[Shapes, NetworkConfig], nn.Module],
     source: Any,
     preset: str,
     options: dict[str, Any],
     device: torch.device | str | None,
     seed: int | None,
     overrides: dict[str, Any],
+    init_from: nn.Module | None = None,
     wrap: Callable[..., Any] = TensorDictModule,
+    roles: bool = False,
 ) -> Any:
     """Build a network in eval mode, its weights channels last: convolutions are twice as fast so.
 
@@ -65,13 +82,15 @@ def build(
     options = {**options, "in_keys": list(in_keys)}
     read = dict(zip(inputs, in_keys, strict=True))
     shapes = Shapes.of(source, read["image"], read.get("instruction", keys.INSTRUCTION))
+    if init_from is not None and (policy := instructed_network(init_from).config).preset == preset:
+        overrides = {"context": policy.context, **overrides}  # it sees as far as its policy
     config = NetworkConfig.of(kind, preset, **overrides)
     if preset == "strong":
         config = replace(config, patch_size=patch_size(shapes, config))
     with torch.random.fork_rng(devices=[], enabled=seed is not None):
         if seed is not None:
             torch.default_generator.manual_seed(seeding.derive(seed, "networks", kind))
-        built = network(shapes, config).eval().to(torch.device(device or "cpu"))
+        built = NETWORKS[kind](shapes, config).eval().to(torch.device(device or "cpu"))
     built = built.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     module = wrap(built, options["in_keys"], [options.get("out_key")])
     module.network_config = Blueprint(kind, shapes, config, options)
@@ -79,13 +98,7 @@ def build(
         read_codes(module, tiles)
     words = attribute(source, "vocabulary")
     module.vocabulary = words if shapes.fit(words) else None
-    return module.eval()
-
-
-def pair_scorer(shapes: Shapes, config: NetworkConfig, images: int = 1) -> PairScorer:
-    """Return the preset's network that scores ``images`` images with an instruction."""
-    kind = GatedScorer if config.preset == "paper" else WordScorer
-    return kind(shapes, config, images)
+    return started(module.eval(), init_from, roles)
 
 
 def make_inverse(
@@ -106,7 +119,7 @@ def make_inverse(
     torch.Size([2, 6])
     """
     options = {"in_keys": in_keys, "out_key": out_key}
-    return build("inverse", InverseNetwork, spec_source, preset, options, device, seed, overrides)
+    return build("inverse", spec_source, preset, options, device, seed, overrides)
 
 
 def make_policy(
@@ -159,9 +172,7 @@ def make_policy(
         "logits_key": logits_key,
         "deterministic": deterministic,
     }
-    return build(
-        "policy", InstructedNetwork, spec_source, preset, options, device, seed, overrides, actor
-    )
+    return build("policy", spec_source, preset, options, device, seed, overrides, wrap=actor)
 
 
 def make_value(
@@ -183,9 +194,9 @@ def make_value(
     torch.Size([2, 1])
     """
     options = {"in_keys": in_keys, "out_key": out_key}
-    network, kind = partial(InstructedNetwork, outputs=1), ValueOperator
-    value = build("value", network, spec_source, preset, options, device, seed, overrides, kind)
-    return started(value, init_from)
+    return build(
+        "value", spec_source, preset, options, device, seed, overrides, init_from, ValueOperator
+    )
 
 
 def make_instruction_classifier(
@@ -222,10 +233,9 @@ def make_instruction_classifier(
     torch.Size([5, 2])
     """
     options = {"in_keys": in_keys, "out_key": out_key}
-    classifier = build(
-        "instruction", pair_scorer, spec_source, preset, options, device, seed, overrides
+    return build(
+        "instruction", spec_source, preset, options, device, seed, overrides, init_from, roles=roles
     )
-    return started(classifier, init_from, roles)
 
 
 def make_goal_classifier(
@@ -255,9 +265,7 @@ def make_goal_classifier(
     torch.Size([2, 1])
     """
     options = {"in_keys": in_keys, "out_key": out_key}
-    scorer = partial(pair_scorer, images=2)
-    classifier = build("goal", scorer, spec_source, preset, options, device, seed, overrides)
-    return started(classifier, init_from)
+    return build("goal", spec_source, preset, options, device, seed, overrides, init_from)
 
 
 def make_reward_model(
@@ -285,5 +293,4 @@ def make_reward_model(
     torch.Size([2, 1])
     """
     options = {"in_keys": in_keys, "out_key": out_key}
-    model = build("reward", RewardNetwork, spec_source, preset, options, device, seed, overrides)
-    return started(model, init_from)
+    return build("reward", spec_source, preset, options, device, seed, overrides, init_from)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -23,19 +23,19 @@ MOST_TILES = 1 << 15
 MOST_REMEMBERED = 1 << 26
 """Bytes of images up to which it is remembered what was found in them."""
 
-Find = TypeVar("Find", bound=Callable[[Tensor, int], Any])
+Found = TypeVar("Found")
 
 
-def remembered(find: Find) -> Find:
+def remembered(find: Callable[[Tensor, int], Found]) -> Callable[[Tensor, int], Found]:
     """Keep what was found in the last images, for whoever asks about the same ones next.
 
     Actor and critic, or policy and reward model, read the same images one after the other. To
     compare them takes a twentieth of the time of finding what repeats.
     """
-    last: tuple[int, Tensor, Any] | None = None
+    last: tuple[int, Tensor, Found] | None = None
 
     @functools.wraps(find)
-    def recall(image: Tensor, number: int) -> Any:
+    def recall(image: Tensor, number: int) -> Found:
         nonlocal last
         if not is_plain(image) or torch.is_inference_mode_enabled():
             return find(image, number)
@@ -49,7 +49,7 @@ def remembered(find: Find) -> Find:
             last = number, words.clone(), found
         return found
 
-    return recall  # type: ignore[return-value]
+    return recall
 
 
 def is_plain(image: Tensor) -> bool:
@@ -212,13 +212,9 @@ def distinct_windows(image: Tensor) -> Windows | None:
     place = torch.arange(index.numel(), device=image.device)
     place = place.new_zeros(len(known)).scatter_(0, index.flatten(), place)
 
-    words = F.pad(as_words(image), (1, 0, 3, 0)).unfold(2, 7, 4)
     row, across = place // (2 * width) % (2 * height), place % (2 * width)
-    which = place // (4 * height * width)
-    before, inside = (words[which, :, row, across // 2 + step] for step in (0, 1))  # [U, C, 7]
-    reaching = ((before >> 40) & 0xFFFFFF) | (inside << 24)
-    pixels = torch.where((across % 2 == 1)[:, None, None], inside >> 8, reaching)
-    pixels = pixels.view(torch.uint8).unflatten(-1, (7, WORD))[..., :7]
+    windows = F.pad(image, (3, 0, 3, 0)).unfold(2, 7, 4).unfold(3, 7, 4)
+    pixels = windows[place // (4 * height * width), :, row, across]
     return Windows(pixels, row == 0, across == 0, index)
 
 

@@ -18,11 +18,6 @@ from ifo_grounding.modules import TURNS, has_word_penalty, in_mode, output_key
 
 
 @dataclass
-class NoKeys:
-    """No keys but the network's."""
-
-
-@dataclass
 class ActionKeys:
     """Key of the actions, which ``set_keys`` changes; the other keys are the network's."""
 
@@ -43,8 +38,10 @@ class SupervisedLoss(LossModule):
         UserError: where it is unclear which output of the network is to learn.
     """
 
-    _AcceptedKeys: Any = NoKeys
+    _AcceptedKeys: Any
     tensor_keys: Any
+    functional = False
+    """The network is used as it is."""
     written: str | None = None
     """How the output that is learned is named, where a network writes several."""
 
@@ -64,11 +61,6 @@ class SupervisedLoss(LossModule):
     def default_keys(self) -> Any:
         """What ``set_keys`` goes back to."""
         return self._AcceptedKeys
-
-    @property
-    def functional(self) -> bool:
-        """Not functional: the network is used as it is."""
-        return False
 
     @property
     def capturable(self) -> bool:
@@ -101,12 +93,6 @@ class SupervisedLoss(LossModule):
     def _mean(self, values: Tensor, tensordict: TensorDictBase | None = None) -> Tensor:
         """Return the mean of a metric over the samples that a mask of TorchRL leaves."""
         return self._reduce_loss(values.detach().float(), tensordict)
-
-
-def flat(tensordict: TensorDictBase, keys: list[NestedKey]) -> TensorDictBase:
-    """Return the entries at ``keys`` with one batch dim."""
-    chosen = tensordict.select(*keys)
-    return chosen.reshape(chosen.batch_size.numel()) if chosen.ndim else chosen.unsqueeze(0)
 
 
 def check_action(action: Tensor, expected: tuple[int, ...], count: int | None = None) -> None:

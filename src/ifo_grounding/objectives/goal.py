@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.errors import at_least_one
-from ifo_grounding.objectives.base import SupervisedLoss, flat
+from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
 
@@ -87,7 +87,7 @@ class GoalLoss(SupervisedLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of a batch of frames, some final."""
         self._require(tensordict)
-        batch = flat(tensordict, self.in_keys)
+        batch = tensordict.select(*self.in_keys).reshape(-1)
         final = batch.get(self.tensor_keys.final).reshape(-1).bool()
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         with self._mode():

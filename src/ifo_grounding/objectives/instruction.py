@@ -13,7 +13,7 @@ from torch import Tensor
 from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one, check_choice
 from ifo_grounding.modules import set_word_swapping
-from ifo_grounding.objectives.base import SupervisedLoss, flat
+from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.objectives.pairs import NegativeInstructions, masked_mean, pair_scores
 
 UNLABELLED = ("removal", "mixture")
@@ -137,7 +137,7 @@ class InstructionLoss(SupervisedLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of a batch of first frames with their instructions."""
         self._require(tensordict)
-        batch = flat(tensordict, self.network.in_keys)
+        batch = tensordict.select(*self.network.in_keys).reshape(-1)
         others = self.negatives.draw(batch.get(self.network.in_keys[-1]), self.count)
         as_learned = getattr(self.network.module, "as_learned", contextlib.nullcontext)
         with self._mode(), as_learned():
