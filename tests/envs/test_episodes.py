@@ -88,14 +88,14 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
     for turn in range(8):
         actions = 1 + torch.randint(5, (256,))
         running = choose(env, td, actions).exclude("reward").set("action", actions)
-        assert torch.equal(running["pixels"], render(env._simulator.state))
+        assert torch.equal(running["pixels"], render(env._simulator.scene.state))
         numbers, mask = env.scene_numbers.clone(), torch.rand(256) < 0.2
         given = running.clone().set("_reset", mask.unsqueeze(-1))
         if foreign:
             given["logits"] = torch.full((256, 6), torch.inf)
             given["collector", "number"] = torch.arange(1, 257)
         td = env.reset(given)
-        assert torch.equal(td["pixels"], render(env._simulator.state))
+        assert torch.equal(td["pixels"], render(env._simulator.scene.state))
         assert torch.equal(td["done"], running["done"] & ~mask.unsqueeze(-1))
         assert torch.equal(td["action"], actions * ~mask)
         assert torch.equal(env.scene_numbers != numbers, mask)
@@ -111,7 +111,7 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
             env._simulator.reset(mask & (mask.cumsum(0) < 4))
             env._simulator.step(torch.randint(5, (256,)))
             td.update(env._observe())
-            assert torch.equal(td["pixels"], render(env._simulator.state))
+            assert torch.equal(td["pixels"], render(env._simulator.scene.state))
 
 
 def own(env, text, **more) -> TensorDict:

@@ -74,7 +74,7 @@ def test_the_seed_of_the_generator_decides_where_reset_names_none():
 
 
 def drawn(env) -> np.ndarray:
-    return render(env._worlds._simulator.state, 32)[0].permute(1, 2, 0).numpy()
+    return render(env._worlds._simulator.scene.state, 32)[0].permute(1, 2, 0).numpy()
 
 
 def test_rgb_array_is_drawn_large():
@@ -126,7 +126,7 @@ def test_a_window_needs_no_screen(monkeypatch, driver):
 
 def test_a_missing_pygame_is_explained(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(gymnasium.error.DependencyNotInstalled, match=r"ifo-grounding\[human\]"):
+    with pytest.raises(UserError, match=r"ifo-grounding\[human\]"):
         PickAndPlaceGymEnv("move", render_mode="human")
 
 

@@ -56,17 +56,18 @@ class NumberedEnv(EnvBase):
         flags = {name: Binary(1, dtype=torch.bool, **flag) for name in DONE}
         self.done_spec = Composite(flags, **on)
 
-    def _asked(self, tensordict: TensorDictBase | None) -> tuple[Tensor | None, Tensor | None]:
-        """Return where episodes begin, None for everywhere, and the scenes asked for there."""
+    def _asked(self, tensordict: TensorDictBase | None) -> tuple[Tensor, Tensor | None]:
+        """Return where episodes begin, bool [num_envs], and the scenes asked for there."""
         given: Any = {} if tensordict is None else tensordict
-        mask, numbers = given.get("_reset", None), given.get(keys.SCENE, None)
-        mask = None if mask is None else mask.reshape(self.num_envs)
+        everywhere = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        mask = given.get("_reset", everywhere).reshape(self.num_envs)
+        numbers = given.get(keys.SCENE, None)
         if numbers is None:
             return mask, None
         if numbers.is_floating_point() or numbers.dtype == torch.bool:
             raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
         numbers = numbers.reshape(self.num_envs).long()
-        if bool(((numbers < 0) & (True if mask is None else mask)).any()):
+        if bool(((numbers < 0) & mask).any()):
             raise UserError("scene numbers start at 0")
         return mask, numbers
 

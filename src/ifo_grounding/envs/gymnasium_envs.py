@@ -163,7 +163,8 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
         """Return what all worlds show, or those of ``rows``, in new arrays."""
         simulator = self._simulator
         index = None if rows is None else torch.from_numpy(rows).to(simulator.device)
-        tokens = simulator.instruction.clone() if index is None else simulator.instruction[index]
+        asked = simulator.scene.instruction
+        tokens = asked.clone() if index is None else asked[index]
         return {
             keys.PIXELS: simulator.pixels(index).cpu().numpy(),
             keys.INSTRUCTION: tokens.cpu().numpy(),
@@ -183,7 +184,7 @@ class PickAndPlaceVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, 
                 )
             numbers = torch.from_numpy(given.astype(np.int64)).to(self._simulator.device)
         self._simulator.reset(begins, numbers)
-        self._texts[mask] = VOCABULARY.decode(self._simulator.instruction[begins].cpu())
+        self._texts[mask] = VOCABULARY.decode(self._simulator.scene.instruction[begins].cpu())
         self._ended = self._ended & ~mask
 
     def _final(
@@ -240,7 +241,7 @@ class PickAndPlaceGymEnv(gymnasium.Env[Observation, int]):
             worlds.reset(seed=seed, options=options)
         else:  # without masks, a sixth faster
             simulator.reset()
-            worlds._texts[:] = VOCABULARY.decode(simulator.instruction.cpu())
+            worlds._texts[:] = VOCABULARY.decode(simulator.scene.instruction.cpu())
         self._show()
         observation = {name: value[0] for name, value in worlds._observe().items()}
         return observation, {TEXT: worlds._texts[0]}

@@ -181,17 +181,13 @@ class PickAndPlaceEnv(NumberedEnv):
         self._simulator.reset(mask, numbers)
         tokens, arranged = self._wish(tensordict), self._wish(tensordict, STATE)
         if tokens is not None or arranged is not None:
-            every = torch.arange(self.num_envs, device=self.device)
-            rows = every if mask is None else every[mask]
+            rows = mask.nonzero().squeeze(-1)
             if arranged is not None:
                 self._simulator.arrange(rows, arranged[rows])
             self._simulator.ask(
-                rows, (self._simulator.instruction if tokens is None else tokens)[rows]
+                rows, (self._simulator.scene.instruction if tokens is None else tokens)[rows]
             )
-        result = self._observe()
-        for name in DONE:
-            result[name] = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
-        return result
+        return self._observe()
 
     def _reset_proc_data(
         self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase
@@ -219,7 +215,7 @@ class PickAndPlaceEnv(NumberedEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.instructed:
-            asked = self._simulator.instruction
+            asked = self._simulator.scene.instruction
             self._check_instruction(tensordict.get(keys.INSTRUCTION, None), asked)
         success, terminated, truncated = self._simulator.step(tensordict.get(keys.ACTION))
         result = self._observe()
@@ -231,19 +227,18 @@ class PickAndPlaceEnv(NumberedEnv):
 
     def _observe(self) -> TensorDict:
         result = TensorDict({}, batch_size=self.batch_size, device=self.device)
-        result[keys.PIXELS] = self._look()
-        if self.instructed:
-            result[keys.INSTRUCTION] = self._simulator.instruction.clone()
-        if self.expose_state:
-            result[STATE] = self._simulator.state.to_tensordict()
-        return result
-
-    def _look(self) -> Tensor:
-        """Return what is shown of the worlds, pixels or codes."""
+        scene = self._simulator.scene
         if self._number is None:
-            return self._simulator.pixels()
-        index = tile_index(self._simulator.state)
-        return self._number.index_select(0, index.flatten().int()).view_as(index)
+            result[keys.PIXELS] = self._simulator.pixels()
+        else:
+            index = tile_index(scene.state)
+            codes = self._number.index_select(0, index.flatten().int())
+            result[keys.PIXELS] = codes.view_as(index)
+        if self.instructed:
+            result[keys.INSTRUCTION] = scene.instruction.clone()
+        if self.expose_state:
+            result[STATE] = scene.state.to_tensordict()
+        return result
 
     def _set_seed(self, seed: int | None) -> None:
         self._simulator.seed(secrets.randbits(31) if seed is None else seed)

@@ -19,8 +19,6 @@ from ifo_grounding.tasks.vocabulary import Vocabulary
 ENDED = "ended"
 """Whether a world has terminated, whether it was truncated, and whether the policy stopped."""
 ADD = "add"
-RESET = "reset", "observation, info"
-STEP = "step", "observation, reward, terminated, truncated, info"
 
 
 def numbered_actions(space: gymnasium.Space, stop: int | str | None) -> tuple[int, int | None]:
@@ -109,7 +107,9 @@ class Reading(gymnasium.Wrapper):
             if "expected 5, got 4" not in str(error):
                 raise
             found = (None,) * 4  # of an old world that TimeLimit or the like took apart
-        observation, reward, terminated, truncated, info = self._parts(found, *STEP)
+        observation, reward, terminated, truncated, info = self._parts(
+            "step", found, "observation, reward, terminated, truncated, info"
+        )
         if self.instructed and self._said(observation, info) not in (None, self._sentence):
             raise UserError(
                 f"the instruction of {self._name} changed in an episode, from {self._sentence!r} "
@@ -120,7 +120,7 @@ class Reading(gymnasium.Wrapper):
 
     def _begin(self, seed: int | None) -> Any:
         """Reset the world, note its instruction, and return the observation."""
-        observation, info = self._parts(self.env.reset(seed=seed), *RESET)
+        observation, info = self._parts("reset", self.env.reset(seed=seed), "observation, info")
         if not self.instructed:
             return observation
         self._sentence = said = self._said(observation, info)
@@ -132,7 +132,7 @@ class Reading(gymnasium.Wrapper):
         self._tokens = self.vocabulary.encode(said, skip_unknown=self.skip_unknown)[0].numpy()
         return observation
 
-    def _parts(self, found: Any, method: str, names: str) -> Any:
+    def _parts(self, method: str, found: Any, names: str) -> Any:
         """Return what a method of the world returned, if it is as Gymnasium has it."""
         got = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
         if got != f"{len(names.split())} values":

@@ -22,7 +22,7 @@ from ifo_grounding.tasks.scenes import (
     draw_scenes,
     leaves,
 )
-from ifo_grounding.world import N_BOXES, N_KINDS, Canvas, WorldState, render, step
+from ifo_grounding.world import N_BOXES, N_KINDS, Canvas, render, step
 from ifo_grounding.world.tiles import TILE_SIZES
 
 RENDER_TILE_SIZE = 32
@@ -114,16 +114,6 @@ class Simulator:
             raise NotBegunError("there is no episode yet: reset the environment first")
         return Scene.of(self._leaves)
 
-    @property
-    def state(self) -> WorldState:
-        """The worlds as they are, [num_envs]."""
-        return self.scene.state
-
-    @property
-    def instruction(self) -> Tensor:
-        """Tokens of each row's instruction, int64 [num_envs, 16]."""
-        return self.scene.instruction
-
     @torch.inference_mode(False)
     def reset(self, mask: Tensor | None = None, numbers: Tensor | None = None) -> None:
         """Begin new episodes, without asking a GPU where.
@@ -187,9 +177,9 @@ class Simulator:
         Raises:
             UserError: where a world has another size, or things that there are not.
         """
-        bounds = {"arm": self.state.objects.shape[-1] - 1, "held": N_KINDS}
+        bounds = {"arm": self.scene.state.objects.shape[-1] - 1, "held": N_KINDS}
         for name, most in {**bounds, "objects": N_KINDS, "boxes": N_BOXES}.items():
-            leaf, new = getattr(self.state, name), worlds.get(name)
+            leaf, new = getattr(self.scene.state, name), worlds.get(name)
             if new.shape != leaf[rows].shape:
                 raise UserError(
                     f"{name} of these worlds is {list(leaf[rows].shape)}, not {list(new.shape)}"
@@ -205,8 +195,8 @@ class Simulator:
             UserError: where a sentence is none of the task's.
         """
         goal = grammar(self.options.task).parse_tokens(tokens)
-        wanted = plan(self.state[rows], goal, self.options.max_steps)
-        asked = [*leaves(self.scene.wanted), self.instruction]
+        wanted = plan(self.scene.state[rows], goal, self.options.max_steps)
+        asked = [*leaves(self.scene.wanted), self.scene.instruction]
         for leaf, new in zip(asked, [*leaves(wanted), tokens], strict=True):
             leaf.index_copy_(0, rows, new.to(leaf))
 
@@ -222,8 +212,8 @@ class Simulator:
             UserError: where actions have another shape, such as one-hot actions, or are others.
         """
         check_actions(action, self.num_envs, keys.N_ACTIONS)
-        state = step(self.state, action)
-        for leaf, new in zip(leaves(self.state), leaves(state), strict=True):
+        state = step(self.scene.state, action)
+        for leaf, new in zip(leaves(self.scene.state), leaves(state), strict=True):
             leaf.copy_(new)
         self.steps += 1
         terminated = action == keys.STOP
@@ -237,9 +227,9 @@ class Simulator:
     def pixels(self, rows: Tensor | None = None) -> Tensor:
         """Draw some rows or all of them, uint8 [R, 3, H, W]."""
         if rows is None:
-            return self._canvas.draw(self.state)
-        return render(self.state[rows], self.tile_size)
+            return self._canvas.draw(self.scene.state)
+        return render(self.scene.state[rows], self.tile_size)
 
     def frames(self, tile_size: int = RENDER_TILE_SIZE) -> np.ndarray:
         """Draw all worlds for people, uint8 [num_envs, H, W, 3]."""
-        return render(self.state, tile_size).permute(0, 2, 3, 1).cpu().numpy()
+        return render(self.scene.state, tile_size).permute(0, 2, 3, 1).cpu().numpy()

@@ -14,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from tensordict import TensorDict, TensorDictBase
 
 from ifo_grounding import keys
-from ifo_grounding.envs.base import DONE, NumberedEnv
+from ifo_grounding.envs.base import NumberedEnv
 from ifo_grounding.envs.reading import ENDED, Reading
 from ifo_grounding.envs.simulator import check_actions
 from ifo_grounding.errors import UserError, at_least_one, check_choice
@@ -162,8 +162,8 @@ class GymnasiumEnv(NumberedEnv):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask, numbers = self._asked(tensordict)
-        if mask is None or int(self.scene_numbers.min()) < 0:  # all begin at the first time
-            mask = torch.ones(self.num_envs, dtype=torch.bool)
+        if int(self.scene_numbers.min()) < 0:  # all begin at the first time
+            mask = torch.ones_like(mask)
         if len(rows := mask.cpu().nonzero().squeeze(-1)):
             if numbers is not None:
                 numbers = numbers.cpu()[rows]
@@ -176,7 +176,7 @@ class GymnasiumEnv(NumberedEnv):
             seeds: Any = [world_seed(self._seed, self.stream, number) for number in numbered]
             given = {"reset_mask": mask.cpu().numpy()}
             self._seen, _ = self._worlds.reset(seed=seeds, options=given)
-        shown = self._observed(**{name: np.zeros(self.num_envs, dtype=bool) for name in DONE})
+        shown = self._observed()
         if (wish := self._wish(tensordict)) is not None:
             self._check_instruction(wish[mask], shown[keys.INSTRUCTION][mask])
         return shown

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib import font_manager
 from numpy.typing import ArrayLike
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.report.theme import FAINT, INK, PAPER, RUNNING
@@ -52,9 +52,7 @@ def upscaled(frame: ArrayLike, width: int) -> Image.Image:
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or not pixels.size:
         raise UserError(f"a frame is uint8 [C, H, W], got {pixels.dtype} {list(pixels.shape)}")
     picture = Image.fromarray(coloured(pixels))
-    scale = max(1, width // picture.width)
-    size = (scale * picture.width, scale * picture.height)
-    return picture.resize(size, Image.Resampling.NEAREST)
+    return ImageOps.scale(picture, max(1, width // picture.width), Image.Resampling.NEAREST)
 
 
 def coloured(frame: np.ndarray) -> np.ndarray:
@@ -111,22 +109,25 @@ def gallery(cells: Sequence[Captioned], *, columns: int = 4, width: int = 200) -
     """
     if not cells:
         raise UserError("a gallery needs at least one picture")
+    return png(draw_sheet(cells, columns=columns, width=width))
+
+
+def png(picture: Image.Image) -> bytes:
+    """Return a picture as the bytes of a PNG."""
     buffer = io.BytesIO()
-    draw_sheet(cells, columns=columns, width=width).save(buffer, format="PNG")
+    picture.save(buffer, format="PNG")
     return buffer.getvalue()
 
 
 def _draw_cell(cell: Captioned, width: int, above: int, below: int) -> Image.Image:
     """Draw one picture with pixels above it for the title, and below it for caption and note."""
-    picture = upscaled(cell.frame, width)
-    framed = (picture.width + 2 * BORDER, picture.height + 2 * BORDER)
-    size = (max(framed[0], width + 2 * BORDER), above + framed[1] + below)
+    picture = ImageOps.expand(upscaled(cell.frame, width), BORDER, cell.colour)
+    size = (max(picture.width, width + 2 * BORDER), above + picture.height + below)
     canvas = Image.new("RGB", size, PAPER)
     draw = ImageDraw.Draw(canvas)
     draw.text((0, 0), one_line(cell.title), FAINT, font(bold=True))
-    draw.rectangle((0, above, framed[0] - 1, above + framed[1] - 1), fill=cell.colour)
-    canvas.paste(picture, (BORDER, above + BORDER))
-    y = above + framed[1] + 4
+    canvas.paste(picture, (0, above))
+    y = above + picture.height + 4
     for line in wrapped(cell.caption, width):
         draw.text((0, y), line, INK, font())
         y += LINE

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import base64
-import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader
 from matplotlib.figure import Figure
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import atomic_write, write_json
-from ifo_grounding.report.drawing import Captioned, gallery, upscaled
+from ifo_grounding.report.drawing import Captioned, gallery, png, upscaled
 from ifo_grounding.report.tables import columns_of, format_cell, is_number
 from ifo_grounding.report.theme import figure_png
 from ifo_grounding.stats.results import plain
@@ -114,13 +112,7 @@ def _picture(picture: Picture, path: Path) -> dict[str, Any]:
     if not picture:
         return {"text": "None."}
     _kept(gallery(picture), path)
-    return {"cases": [(case, _data(_png(case.frame))) for case in picture]}
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    upscaled(pixels, 192).save(buffer, format="PNG")
-    return buffer.getvalue()
+    return {"cases": [(case, _data(png(upscaled(case.frame, 192)))) for case in picture]}
 
 
 def _suffix(content: bytes) -> str:

@@ -65,15 +65,12 @@ class WorldState(TensorClass):
         return math.isqrt(self.objects.shape[-1])
 
     @classmethod
-    def empty(
-        cls, batch: int, size: int = 6, device: torch.device | str | None = None
-    ) -> WorldState:
+    def empty(cls, batch: int, size: int = 6) -> WorldState:
         """Return worlds without objects or boxes, the arm in the top left cell."""
-        cells = size * size
         return cls(
-            arm=torch.zeros(batch, dtype=torch.int64, device=device),
-            held=torch.zeros(batch, dtype=torch.uint8, device=device),
-            objects=torch.zeros(batch, cells, dtype=torch.uint8, device=device),
-            boxes=torch.zeros(batch, cells, dtype=torch.uint8, device=device),
+            arm=torch.zeros(batch, dtype=torch.int64),
+            held=torch.zeros(batch, dtype=torch.uint8),
+            objects=torch.zeros(batch, size * size, dtype=torch.uint8),
+            boxes=torch.zeros(batch, size * size, dtype=torch.uint8),
             batch_size=[batch],
         )

@@ -26,6 +26,8 @@ from ifo_grounding.worlds.base import World
 class Tiled(World):
     """A world of which the simulator can show numbers of tiles in place of pixels."""
 
+    actions, stop_action = keys.ACTIONS, keys.STOP
+
     def __init_subclass__(cls) -> None:
         """Let a simulator that a subclass has changed show pixels, which may be other ones."""
         if Tiled not in cls.__bases__ and "simulator" in vars(cls) and "coded" not in vars(cls):
@@ -76,8 +78,7 @@ class Grid(Tiled):
     def __post_init__(self) -> None:
         grammar(self.task)
         self.layout = Layout(self.size, (*self.objects,), (*self.boxes,), self.inside)
-        self.actions, self.stop_action, self.vocabulary = keys.ACTIONS, keys.STOP, VOCABULARY
-        self.oracle = self
+        self.vocabulary, self.oracle = VOCABULARY, self
 
     def scenes(self, **chosen: Any) -> dict[str, Any]:
         """Return the arguments that environments, recorder and oracle share."""
@@ -138,14 +139,10 @@ class Grid(Tiled):
         return REASONS[int(verdict(state, goal))]
 
 
-@dataclass
 class OpenGrid(Tiled):
     """The same grid with sentences of a person's own, of which nobody knows what fulfils them."""
 
     judged = False
-
-    def __post_init__(self) -> None:
-        self.actions, self.stop_action = keys.ACTIONS, keys.STOP
 
     def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions; see :class:`World`."""
