@@ -88,6 +88,9 @@ class DiscriminatorLoss(SupervisedLoss):
         loss = (F.softplus(-right).mean() + negative) / 2
         return TensorDict({"loss_discriminator": loss, **found})
 
+    adversarial = forward
+    """As :class:`~ifo_grounding.training.AdversarialUpdates` asks for it."""
+
     def _logits(self, batch: TensorDictBase) -> Tensor:
         if not len(batch):
             return torch.zeros(0)
@@ -198,11 +201,6 @@ class Adversary(AdversarialUpdates):
     def paid(self) -> DiscriminatorReward:
         """Return the transform that pays."""
         return DiscriminatorReward(self.network)
-
-    def losses(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
-        """Compute the loss of a batch of demonstrated steps and one of the policy's."""
-        found: TensorDict = self.loss(demonstrations, policy)
-        return found
 
 
 class GAIL(Adversary):

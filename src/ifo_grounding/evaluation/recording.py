@@ -90,17 +90,17 @@ def record_episodes(
             )
         if sentence is not None or state is not None:
             start = _asked(env, scenes, sentence, state)
-        frames.extend([frame] for frame in _seen(env, start.reshape(rows), render_tile_size))
+        first = start.reshape(rows)
+        seen = _seen(env, torch.arange(rows), first, render_tile_size)
+        frames.extend([frame] for frame in seen)
         vocabulary: Vocabulary = attribute(env, "vocabulary", VOCABULARY)
-        sentences.extend(vocabulary.decode(start.reshape(rows)[keys.INSTRUCTION].cpu()))
+        sentences.extend(vocabulary.decode(first[keys.INSTRUCTION].cpu()))
 
         def keep(running: Tensor, transition: TensorDictBase) -> None:
-            # The grid is drawn as a whole, at the size for people; of others, the rows that moved.
-            whole = isinstance(env, PickAndPlaceEnv)
-            seen = _seen(env, transition[keys.NEXT], render_tile_size)
+            seen = _seen(env, running, transition[keys.NEXT], render_tile_size)
             taken = transition[keys.ACTION].tolist()
-            for place, (row, action) in enumerate(zip(running.tolist(), taken, strict=True)):
-                frames[row].append(seen[row if whole else place])
+            for row, frame, action in zip(running.tolist(), seen, taken, strict=True):
+                frames[row].append(frame)
                 actions[row].append(action)
 
         return player(env, start, on_step=keep)
@@ -139,8 +139,8 @@ def _asked(env: EnvBase, scenes: Sequence[int], sentence: str | None, state: Any
     return start
 
 
-def _seen(env: EnvBase, shown: TensorDictBase, tile_size: int | None) -> np.ndarray:
-    """Return frames, uint8 [B, C, H, W]: of all rows of a grid, else of the rows in ``shown``."""
+def _seen(env: EnvBase, rows: Tensor, shown: TensorDictBase, tile_size: int | None) -> np.ndarray:
+    """Return frames of some rows, which ``shown`` is of, uint8 [R, C, H, W]; grids are drawn."""
     if not isinstance(env, PickAndPlaceEnv):
         return shown[keys.PIXELS].cpu().numpy()
-    return env.render(tile_size or env.tile_size).transpose(0, 3, 1, 2)
+    return env.render(tile_size or env.tile_size).transpose(0, 3, 1, 2)[rows.cpu().numpy()]

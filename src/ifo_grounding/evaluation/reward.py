@@ -7,18 +7,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.data import Demonstrations, Truth
+from ifo_grounding.data import Demonstrations, Truth, labelled_buffer
 from ifo_grounding.episodes import Policy
 from ifo_grounding.errors import UserError, at_least_one, check_below
 from ifo_grounding.evaluation.labels import actions_of
 from ifo_grounding.evaluation.scenes import Player, play_scenes
-from ifo_grounding.modules import device_of, evaluating
+from ifo_grounding.modules import beside, evaluating
 from ifo_grounding.stats import Described, Estimate, Rate, auc, wilson
 from ifo_grounding.transforms import GoalReward, LearnedReward
 
@@ -63,8 +64,8 @@ def reward_audit(
             "transitions: give the truth of these very demonstrations"
         )
     check_below("for this model, truth holds action", actions, n_actions)
-    episode, frame = demos.locate()
-    scores = _score_actions(reward_model, demos, episode, frame, n_actions)
+    episode, _ = demos.locate()
+    scores = _score_actions(reward_model, labelled_buffer(demos, actions), n_actions)
     taken = torch.nn.functional.one_hot(actions, n_actions).bool()
     # Ties do not count as first: a model that finds everything right knows nothing.
     others = scores.masked_fill(taken, -torch.inf).max(1).values
@@ -74,26 +75,16 @@ def reward_audit(
     )
 
 
-def _score_actions(
-    reward_model: TensorDictModuleBase,
-    demos: Demonstrations,
-    episode: Tensor,
-    frame: Tensor,
-    n_actions: int,
-) -> Tensor:
+def _score_actions(model: TensorDictModuleBase, buffer: ReplayBuffer, n_actions: int) -> Tensor:
     """Logits of every action in every transition, float32 [N, A]."""
-    device = device_of(reward_model) or torch.device("cpu")
-    instructions, scores = demos.instructions, []
-    with evaluating(reward_model):
-        for part in torch.arange(len(frame)).split(max(1, AT_ONCE // n_actions)):
-            seen = {
-                keys.PIXELS: demos.frames(frame[part]),
-                keys.INSTRUCTION: instructions[episode[part]],
-            }
-            batch = TensorDict(seen, [len(part)]).repeat_interleave(n_actions, dim=0).to(device)
-            batch[keys.ACTION] = torch.arange(n_actions, device=device).repeat(len(part))
-            logit = reward_model(batch)[keys.ACTION_SCORE]
-            scores.append(logit.float().reshape(len(part), n_actions).cpu())
+    scores = []
+    with evaluating(model):
+        for rows in torch.arange(len(buffer)).split(max(1, AT_ONCE // n_actions)):
+            seen = beside(buffer[rows], model).select(keys.PIXELS, keys.INSTRUCTION)
+            batch = seen.repeat_interleave(n_actions, dim=0)
+            batch[keys.ACTION] = torch.arange(n_actions, device=batch.device).repeat(len(rows))
+            logit = model(batch)[keys.ACTION_SCORE]
+            scores.append(logit.float().reshape(len(rows), n_actions).cpu())
     return torch.cat(scores)
 
 

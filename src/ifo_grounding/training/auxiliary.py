@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
@@ -50,6 +50,8 @@ class AdversarialUpdates:
     Demonstrated actions are positives, the policy's own actions are negatives.
 
     Args:
+        loss: its ``adversarial(demonstrated, own)`` is minimised, as of
+            :class:`~ifo_grounding.objectives.RewardLoss`.
         steps: gradient steps after each iteration of self-examination.
         batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
     """
@@ -74,11 +76,6 @@ class AdversarialUpdates:
         for _ in range(self.steps):
             rows = torch.randint(len(policy_steps), (self.batch_size,))
             shown = beside(self.demonstrations.sample(self.batch_size), self.loss)
-            losses = self.losses(shown, policy_steps[rows])
+            losses = self.loss.adversarial(shown, policy_steps[rows])
             updates.append(update(losses, self.optimizer, grad_clip=1.0))
         return {f"reward/{key}": value for key, value in means(updates).items()}
-
-    def losses(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
-        """Compute the loss of a batch of demonstrated steps and one of the policy's."""
-        found: TensorDict = self.loss.adversarial(demonstrations, policy)
-        return found

@@ -37,10 +37,8 @@ def difference(
     """
     before, now = leaves(made), leaves(asked)
     for name in dict.fromkeys([*before, *now]):
-        if any(name == each or name.startswith(f"{each}.") for each in free):
-            continue
         there, here = before.get(name), now.get(name)
-        if there == here:
+        if there == here or any(f"{name}.".startswith(f"{each}.") for each in free):
             continue
         if name in before and name in now:
             return f"made with {name}={_written(there)}, not {_written(here)}: leave it out"

@@ -29,12 +29,6 @@ PATIENCE = 60.0
 """Seconds in which a cluster has to find room for all workers."""
 TRIES = 3
 """How often workers begin to collect the same steps."""
-OPTIONS = {
-    "reset_at_each_iter": True,
-    "trust_policy": True,
-    "auto_register_policy_transforms": False,
-}
-"""Of collectors."""
 
 
 class Here:
@@ -48,7 +42,9 @@ class Here:
             frames_per_batch=env.batch_size.numel() * steps,
             total_frames=-1,
             return_same_td=env.device is not None and env.device.type == "cpu",
-            **OPTIONS,
+            reset_at_each_iter=True,
+            trust_policy=True,
+            auto_register_policy_transforms=False,
         )
         self.batches = iter(self.collector)
         sampler_stats(env)  # forgets the reset that a collector begins with

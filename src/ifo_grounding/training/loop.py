@@ -33,14 +33,13 @@ class Loop:
     ) -> None:
         self.name, self.iterations, self.saved, self.seconds = name, iterations, saved, seconds
         self.log, self.progress = log, progress
-        state = (saved.load() if saved else None) or {"iteration": 0, "history": []}
-        self.done: int = state["iteration"]
-        self.history: list[Metrics] = state["history"]
+        state = saved.load() if saved else None
+        self.history: list[Metrics] = state["history"] if state else []
         self._last_save = time.monotonic()
 
     def __iter__(self) -> Iterator[int]:
         """Yield the iterations that are still to be done, and show how far they are."""
-        first, end = self.done, self.iterations
+        first, end = len(self.history), self.iterations
         how = {"total": end, "initial": first, "leave": False}
         with progress_bar(desc=self.name, shown=self.progress, **how) as bar:
             for iteration in range(first, end):
@@ -62,11 +61,10 @@ class Loop:
                 f"{self.name} diverged: {', '.join(lost)} no longer finite by step {step}; learn "
                 "with a lower lr"
             )
-        self.done += 1
         self.history.append(metrics)
         if self.log:
             self.log(metrics, step)
-        due = time.monotonic() - self._last_save > self.seconds or self.done >= self.iterations
-        if self.saved and due:
-            self.saved.save({"iteration": self.done, "history": self.history})
+        last = len(self.history) >= self.iterations
+        if self.saved and (last or time.monotonic() - self._last_save > self.seconds):
+            self.saved.save({"history": self.history})
             self._last_save = time.monotonic()

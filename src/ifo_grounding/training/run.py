@@ -134,14 +134,14 @@ class Run:
         """
         path = self / OPTIONS
         try:
-            if not path.exists():
-                return None
+            file = path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
         except OSError as error:  # a name that is too long
             raise UserError(
                 f"run={self.name!s:.40}... names no folder ({error.strerror})"
             ) from None
         try:
-            file = path.stat()
             options = _read_options(path.resolve(), file.st_ino, file.st_mtime_ns, file.st_size)
             if isinstance(options, dict):
                 return {str(name): copy.deepcopy(value) for name, value in options.items()}
@@ -187,9 +187,8 @@ class Run:
         path = self / f"metrics/{name}.json"
         rows = read_json(path, list) if path.exists() else []
         for row in rows:
-            values = list(row.values()) if isinstance(row, dict) else [""]
-            numbers = all(value is None or type(value) in NUMBERS for value in values)
-            if not numbers or type(row.get("step")) not in NUMBERS:
+            known = isinstance(row, dict) and type(row.get("step")) in NUMBERS
+            if not known or not all(v is None or type(v) in NUMBERS for v in row.values()):
                 raise UserError(f"{path} holds no metrics: delete it or restore it")
         return rows
 

@@ -25,6 +25,8 @@ from ifo_grounding.training.reseeding import reseed, sampler_stats, stored_start
 from ifo_grounding.training.updates import total_loss
 
 CLEARLY = 2.0
+AT_ONCE = 1024
+"""Held-out samples that are measured together, to bound memory."""
 
 
 class BestWeights:
@@ -78,17 +80,16 @@ class EarlyStopping(BestWeights):
     True
     """
 
-    def __init__(self, loss: nn.Module, buffer: ReplayBuffer, batch_size: int = 1024) -> None:
-        _check_held_out(buffer)
+    def __init__(self, loss: nn.Module, buffer: ReplayBuffer) -> None:
         super().__init__(loss)
-        self.buffer, self.batch_size = buffer, batch_size
+        self.buffer = _held_out(buffer)
 
     def measure(self) -> Metrics:
         """Return the loss on all samples, and remember the weights if it is the lowest so far."""
         total = 0.0
         with evaluating(self.module), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # the same negatives every time
-            for rows in torch.arange(len(self.buffer)).split(self.batch_size):
+            for rows in torch.arange(len(self.buffer)).split(AT_ONCE):
                 losses = self.module(beside(self.buffer[rows], self.module))
                 total += float(total_loss(losses)) * len(rows)
         mean = total / len(self.buffer)
@@ -117,18 +118,15 @@ class HeldOutAccuracy:
     torch.Size([4])
     """
 
-    def __init__(
-        self, policy: TensorDictModuleBase, buffer: ReplayBuffer, batch_size: int = 1024
-    ) -> None:
-        _check_held_out(buffer)
-        self.policy, self.buffer, self.batch_size = policy, buffer, batch_size
+    def __init__(self, policy: TensorDictModuleBase, buffer: ReplayBuffer) -> None:
+        self.policy, self.buffer = policy, _held_out(buffer)
         self.first: Tensor | None = None
 
     def measure(self) -> Tensor:
         """Return the share of each demonstration's actions that the policy takes, float32 [D]."""
         right, final = [], []
         with evaluating(self.policy), exploring(ExplorationType.DETERMINISTIC):
-            for rows in torch.arange(len(self.buffer)).split(self.batch_size):
+            for rows in torch.arange(len(self.buffer)).split(AT_ONCE):
                 seen = beside(self.buffer[rows], self.policy)
                 label = seen.pop(keys.ACTION)
                 right.append((self.policy(seen)[keys.ACTION] == label).float().cpu())
@@ -188,7 +186,11 @@ class BestCheckpoint(BestWeights):
         by_accuracy: bool = False,
     ) -> None:
         if by_accuracy and held_out is None:
-            raise UserError("to choose by accuracy takes demonstrations: give held_out=")
+            raise UserError(
+                "adversarial updates change the reward model, whose returns cannot then be "
+                "compared from one iteration to the next, so that accuracy selects the best "
+                "policy: give held_out=, or set select_every=0 to keep the last"
+            )
         super().__init__(policy)
         self.env, self.seed = env, seed
         self.episodes, self.max_steps, self.margin = episodes, max_steps, margin
@@ -264,9 +266,10 @@ def learned_returns(env: EnvBase, policy: nn.Module, episodes: int, max_steps: i
     return torch.cat(found)[:episodes]
 
 
-def _check_held_out(buffer: ReplayBuffer) -> None:
+def _held_out(buffer: ReplayBuffer) -> ReplayBuffer:
     if not len(buffer):
         raise UserError("there are no held-out samples: hold a larger share out")
+    return buffer
 
 
 def _error(values: Tensor) -> float:

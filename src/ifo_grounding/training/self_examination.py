@@ -164,11 +164,9 @@ def improve_policy(
             f"the policy must be an actor, as make_policy gives, got {type(policy).__name__}: of "
             "others before an actor make one by ProbabilisticTensorDictSequential(*others, *actor)"
         )
-    _check(env, config, adversarial, held_out)
+    _check(env)
     if workers and stored_starts(env):
         raise UserError("stored pairs are cycled through in one process: do without workers")
-    policy.eval()
-    value.eval()
     # Before a collector resets the env, so that it remembers the first starts.
     best = BestCheckpoint(
         env,
@@ -180,6 +178,8 @@ def improve_policy(
         held_out=held_out,
         by_accuracy=adversarial is not None and config.select_every > 0,
     )
+    policy.eval()
+    value.eval()
     learner = Learner(policy, value, config, imitation)
     there = policy, config.steps
     where = OnRay(env, *there, workers) if workers else Here(env, *there)
@@ -214,13 +214,8 @@ def improve_policy(
     return loop.history
 
 
-def _check(
-    env: EnvBase,
-    config: SelfExaminationConfig,
-    adversarial: AdversarialUpdates | None,
-    held_out: HeldOutAccuracy | None,
-) -> None:
-    """Refuse an env that lacks something, and a selection that is impossible."""
+def _check(env: EnvBase) -> None:
+    """Refuse an env that lacks something."""
     observed = env.observation_spec.keys(True, True)
     if keys.INSTRUCTION not in observed:
         raise UserError("the env has no instructions: add InstructionSampler or StartingPairs")
@@ -232,12 +227,6 @@ def _check(
         raise UserError(
             "StartingPairs inside a worker cannot be seeded or gone back to: do without workers; "
             "more rows (num_envs) are faster"
-        )
-    if config.select_every and adversarial is not None and held_out is None:
-        raise UserError(
-            "adversarial updates change the reward model, whose returns cannot then be compared "
-            "from one iteration to the next: give held_out=, by whose accuracy the best policy is "
-            "selected, or set select_every=0 to keep the last"
         )
 
 

@@ -39,14 +39,12 @@ class EpisodeTransform(Transform):
     def reset_key(self) -> NestedKey:
         """Key of the mask of rows that begin an episode."""
         names = ["_reset"] if self.parent is None else self.parent.reset_keys
-        if len(names) == 1:
-            return names[0]
-        if "_reset" in names:
-            return "_reset"
-        raise UserError(
-            f"{type(self).__name__} needs one done entry for the whole environment, found "
-            f"{len(names)}: {names}"
-        )
+        if len(names) > 1 and "_reset" not in names:
+            raise UserError(
+                f"{type(self).__name__} needs one done entry for the whole environment, found "
+                f"{len(names)}: {names}"
+            )
+        return "_reset" if "_reset" in names else names[0]
 
     def new_rows(self, tensordict: TensorDictBase | None, rows: int) -> Tensor:
         """Numbers of the rows that begin an episode, int64 [R], of ``rows`` rows."""

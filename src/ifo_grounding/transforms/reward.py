@@ -87,9 +87,7 @@ class RewardTransform(EpisodeTransform):
         if not rows:
             return torch.zeros(0, dtype=torch.float32, device=home)
         device, key = device_of(self.model) or home, self.logit_key
-        batch = TensorDict({}, batch_size=[rows])
-        for name, entry in zip(self.model.in_keys, entries, strict=True):
-            batch.set(name, entry)
+        batch = TensorDict(dict(zip(self.model.in_keys, entries, strict=True)), [rows])
         with evaluating(self.model):
             parts = [
                 flat_logit(self.model(part.to(device)).get(key), len(part), key)

@@ -162,10 +162,9 @@ class InstructionSampler(InstructionTransform):
         request = tensordict_reset.clone()
         group = parent.done_keys_groups[parent.reset_keys.index(self.reset_key)]
         done = request.get(group[0])
-        mask = torch.zeros(tensordict_reset.batch_size.numel(), dtype=torch.bool)
-        mask[rows.cpu()] = True
-        mask = mask.to(done.device).view(*tensordict_reset.batch_size, 1).expand(done.shape)
-        request.set(self.reset_key, mask.clone())
+        mask = done.new_zeros(done.shape, dtype=torch.bool)
+        mask.view(tensordict_reset.batch_size.numel(), -1)[rows.to(done.device)] = True
+        request.set(self.reset_key, mask)
         if isinstance(parent, TransformedEnv) and not len(parent.transform):
             parent = parent.base_env  # which need not choose between old and new pixel by pixel
         return parent.reset(request, select_reset_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 import torch
@@ -66,17 +67,12 @@ class StartingPairs(InstructionTransform):
             raise UserError(f"scene must be int64 [N, 1], got {scene.dtype} {list(scene.shape)}")
         self.register_buffer("scenes", scene.reshape(-1), persistent=False)
         self.hashes = None if hashes is None else hashes.reshape(-1)
-        self._begin(seed)
+        self.seed, self.used = seed, 0
 
     fixes_scenes = True
     """The simulator's own seed decides nothing, since every scene is asked for by number."""
 
     scenes: Tensor
-
-    def _begin(self, seed: int, used: int = 0) -> None:
-        self.seed, self.used = seed, used
-        self._epoch, self._order = -1, torch.empty(0, dtype=torch.int64)
-        self._current = self._order
 
     def get_extra_state(self) -> Tensor:
         """Return the place in the order: ``state_dict`` resumes there."""
@@ -84,21 +80,15 @@ class StartingPairs(InstructionTransform):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Resume at a place in the order."""
-        self._begin(*state.tolist())
+        self.seed, self.used = state.tolist()
 
     def _take(self, count: int) -> Tensor:
-        """Take the next pairs, int64 [count]."""
-        taken, pairs = [], len(self.scenes)
-        while count:
-            epoch, place = divmod(self.used, pairs)
-            if epoch != self._epoch:
-                source = generator(self.seed, "starting-pairs", epoch)
-                self._epoch, self._order = epoch, torch.randperm(pairs, generator=source)
-            part = self._order[place : place + count]
-            taken.append(part)
-            self.used += len(part)
-            count -= len(part)
-        return torch.cat(taken) if taken else self._order[:0]
+        """Take the next pairs, int64 [count]: each epoch has all of them in an order of its own."""
+        pairs, first = len(self.scenes), self.used
+        self.used += count
+        epochs = range(first // pairs, self.used // pairs + 1)
+        orders = [_order(pairs, self.seed, epoch) for epoch in epochs]
+        return torch.cat(orders)[first % pairs :][:count]
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         parent = self.parent
@@ -143,6 +133,12 @@ class StartingPairs(InstructionTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return stored data as it is: pairs are drawn where an environment resets."""
         return tensordict
+
+
+@functools.lru_cache(maxsize=8)
+def _order(pairs: int, seed: int, epoch: int) -> Tensor:
+    """Return the numbers of all pairs in the order of an epoch."""
+    return torch.randperm(pairs, generator=generator(seed, "starting-pairs", epoch))
 
 
 def frame_hash(pixels: Tensor) -> Tensor:
