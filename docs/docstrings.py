@@ -1,11 +1,13 @@
 """Docstrings for the API pages: examples become sections, roles plain code, maths maths."""
 
 import re
+import textwrap
 from typing import Any
 
 import griffe
 
 ROLE = re.compile(r":(?:class|func|meth|mod|data|attr):`~?([\w.]+)`")
+EXAMPLES = re.compile(r"^>>> .*(?:\n.+)*", re.MULTILINE)
 MATH = re.compile(r"^\.\. math:: (.+)$", re.MULTILINE)
 
 
@@ -13,14 +15,7 @@ def rewrite(text: str) -> str:
     """Indent bare examples under an ``Examples:`` heading, which the page renders as code."""
     text = ROLE.sub(r"`\1`", text)
     text = MATH.sub(lambda found: f"\\[ {found[1]} \\]", text)
-    lines, inside = [], False
-    for line in text.splitlines():
-        starts = line.startswith(">>> ")
-        if starts and not inside:
-            lines += ["Examples:"]
-        inside = (inside or starts) and bool(line.strip())
-        lines.append(f"    {line}" if inside else line)
-    return "\n".join(lines)
+    return EXAMPLES.sub(lambda found: f"Examples:\n{textwrap.indent(found[0], 4 * ' ')}", text)
 
 
 class Docstrings(griffe.Extension):

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 from typing import Any
 
 from ifo_grounding.config import Options
-from ifo_grounding.options import field_docs, options_of, written
+from ifo_grounding.options import field_docs, options_of
+from ifo_grounding.report import markdown_table
 from ifo_grounding.training import FitConfig
+from ifo_grounding.training.checkpoint import written
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
 SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
@@ -25,32 +27,28 @@ def described() -> str:
     composed = (options_of(f"preset={name}") for name in ("strong", "paper"))
     presets = [replace(each, run=Options.run) for each in composed]
     values = {name: [getattr(each, name) for each in presets] for name in SECTIONS}
-    general = [f.name for f in fields(Options) if f.name not in (*SECTIONS, "world")]
-    learning = [*field_docs(FitConfig)]
+    general, learning = field_docs(Options), field_docs(FitConfig)
+    del general["world"]  # which has sections of its own
+    rows = [
+        {"option": f"`{name}`", **{f: shown(values[f], name) for f in FITTED}, "meaning": meaning}
+        for name, meaning in learning.items()
+    ]
     said = f"Each in {', '.join(f'`{name}`' for name in FITTED)}, such as `imitate.lr`."
-    parts = ["## General\n", listed(Options, general, "", presets)]
-    parts += [f"## How networks learn\n\n{said}\n"]
-    parts += [table(FitConfig, learning, "", **{name: values[name] for name in FITTED})]
+    parts = ["## General\n", listed(general, "", presets)]
+    parts += [f"## How networks learn\n\n{said}\n", f"{markdown_table(rows)}\n"]
     for name, kind in {**SECTIONS, **WORLDS}.items():
-        shown = values.get(name) or [SimpleNamespace(**options_of(name).world)]
-        if own := [n for n in field_docs(kind) if name not in FITTED or n not in learning]:
+        of = values.get(name) or [SimpleNamespace(**options_of(name).world)]
+        own = {n: m for n, m in field_docs(kind).items() if name not in FITTED or n not in learning}
+        if own:
             said = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("``", "`")
-            parts += [f"## {name}\n\n{said}\n"]
-            parts += [listed(kind, own, f"{name.partition('=')[0]}.", shown)]
+            parts += [f"## {name}\n\n{said}\n", listed(own, f"{name.partition('=')[0]}.", of)]
     return "\n".join(parts)
 
 
-def listed(kind: type, names: list[str], above: str, values: list) -> str:
+def listed(meanings: dict[str, str], above: str, values: list) -> str:
     """Return a line for each option, which a narrow screen can break."""
-    docs = field_docs(kind)
-    return "".join(f"- **`{above}{n}`** = {shown(values, n)}: {docs[n]}\n" for n in names)
-
-
-def table(kind: type, names: list[str], above: str, **columns: list) -> str:
-    docs, head = field_docs(kind), ["option", *columns, "meaning"]
-    rows = [[f"`{above}{n}`", *(shown(v, n) for v in columns.values()), docs[n]] for n in names]
-    lines = (" | ".join(row) for row in [head, ["---"] * len(head), *rows])
-    return "".join(f"| {line} |\n" for line in lines)
+    lines = (f"- **`{above}{n}`** = {shown(values, n)}: {meanings[n]}\n" for n in meanings)
+    return "".join(lines)
 
 
 def shown(values: list, name: str) -> str:

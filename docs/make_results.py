@@ -10,8 +10,8 @@ from make_tables import TABLE_2, pieces
 from pages import NOT_RUN, Row, Runs, chosen, difference, gain, ran, rate, read, success, write
 
 from ifo_grounding.report import figure_png, markdown_table, rates_by_number, training_curves
-from ifo_grounding.report.results import brief, unpacked
-from ifo_grounding.stats import Difference, Rate, holm, paired_difference
+from ifo_grounding.report.results import brief
+from ifo_grounding.stats import Rate, holm
 from ifo_grounding.tasks import TASKS
 
 LEVELS = ("GoToObj", "GoToLocal", "PickupLoc")
@@ -131,8 +131,9 @@ def by_method(task: str, number: int) -> dict[str, Runs]:
 def baseline_rows(task: str, number: int) -> list[Row]:
     """Return a row for each method; p is corrected for the number of rivals of ours."""
     found, rows = by_method(task, number), []
-    behind = {m: ahead(runs, m, found) for m, runs in found.items() if ACCESS[m][0]}
-    behind = {method: each for method, each in behind.items() if each}
+    rivals = [method for method in found if ACCESS[method][0] and method != "ours"]
+    both = {method: with_ours(found[method], found.get("ours", [])) for method in rivals}
+    behind = {method: difference(runs, method, "ours") for method, runs in both.items() if runs}
     p = dict(zip(behind, holm([each.p_value for each in behind.values()]), strict=True))
     for method, runs in found.items():
         actions, steps, what = ACCESS[method]
@@ -147,14 +148,11 @@ def baseline_rows(task: str, number: int) -> list[Row]:
     return rows
 
 
-def ahead(runs: Runs, method: str, found: dict[str, Runs]) -> Difference | None:
-    """Return by how much ours is ahead of a method on the same scenes with the same seeds."""
-    ours = {run["options"]["seed"]: run for run in found.get("ours", ())}
-    both = [run for run in runs if run["options"]["seed"] in ours]
-    if method == "ours" or not both:
-        return None
-    same = [ours[run["options"]["seed"]] for run in both]
-    return paired_difference(unpacked(both, method), unpacked(same, "ours"))
+def with_ours(runs: Runs, ours: Runs) -> Runs:
+    """Return the results of runs beside ours of the same seed, where there are any."""
+    same = {run["options"]["seed"]: run["results"] for run in ours}
+    there = [run for run in runs if run["options"]["seed"] in same]
+    return [{"results": run["results"] | same[run["options"]["seed"]]} for run in there]
 
 
 def shown_p(value: float) -> str:
@@ -164,24 +162,23 @@ def shown_p(value: float) -> str:
 def peer_rows() -> list[Row]:
     """Return how often our GAIL and that of another package succeed, by frames."""
     runs = read("peers", lambda _: "gail")["gail"]
-    measured = {int(name.rsplit(", ", 1)[1]) for name in runs[0]["results"]}
-    return [
-        {"frames": f"{frames:,}", "seeds": len(runs)}
-        | {name: success(runs, f"{name}, {frames}") for name in PEERS}
-        for frames in sorted(measured)
-    ]
+    rows = []
+    for frames in sorted({int(name.rsplit(", ", 1)[1]) for name in runs[0]["results"]}):
+        rates = {name: success(runs, f"{name}, {frames}") for name in PEERS}
+        rows.append({"frames": f"{frames:,}", "seeds": len(runs), **rates})
+    return rows
 
 
 def baseline_curves(task: str, number: int) -> bytes:
     """Draw the success on validation scenes of each method that learns by policy gradient."""
-    history: dict[float, dict[str, float]] = {}
-    for method, runs in by_method(task, number).items():
-        for frames, reached in runs[0]["results"].get("curve", ()):
-            history.setdefault(frames, {"step": frames})[method] = reached
-    names = [name for name in ACCESS if any(name in row for row in history.values())]
-    rows = [history[frames] for frames in sorted(history)]
+    rows = [
+        {"step": frames, method: reached}
+        for method, runs in by_method(task, number).items()
+        for frames, reached in runs[0]["results"].get("curve", ())
+    ]
     title = f"{task}, {number:,} demonstrations: success"
-    return figure_png(training_curves(rows, {title: {name: name for name in names}}))
+    history = sorted(rows, key=lambda row: row["step"])
+    return figure_png(training_curves(history, {title: {name: name for name in ACCESS}}))
 
 
 def minutes(runs: Runs) -> int:

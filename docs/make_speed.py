@@ -86,12 +86,10 @@ def of_scale() -> str:
             (ours,) = row["rates"].keys() - row["ratios"].keys()
             line = {"what": f"{row['name']}: {ours}", "times as fast as": against}
             lines.append({**line, "measured": between(ratio), "asked": row["reach"][against]})
-    rows, limit = found["growth"]["rows"], found["growth"]["limit"]
-    of = {"frames/s": "frames/s", "bound": "if learning took no time"}
-    model = [
-        {"workers": f"{row['workers']}", **{title: short(row[key]) for key, title in of.items()}}
-        for row in rows[::2]
-    ]
+    limit, model = found["growth"]["limit"], []
+    for row in found["growth"]["rows"][::2]:
+        line = {"workers": f"{row['workers']}", "frames/s": short(row["frames/s"])}
+        model.append({**line, "if learning took no time": short(row["bound"])})
     text = (
         "A model of BabyAI practice, 64 worlds a worker, 1 Gbit/s, from one process's times. "
         "Workers wait while the learner receives and learns: beyond "

@@ -110,14 +110,14 @@ def trained(options: Options) -> Any:
         return RandomPolicy(env.action_spec)
     if method == "lc-rl":
         return planned(options)
-    if method == "bc":
+    if method in ("bc", "gail+bc"):
         imitate_truth(options)
-    if method in ADVERSARIES:
-        run = adversarial(options)
-    elif method == "bco-alpha":
-        run = bco_alpha(options)
-    else:
-        run = open_run(options)
+    run = open_run(options)
+    if method in ADVERSARIES or method == "bco-alpha":
+        stage = trained_by(options)
+        if stage.result is None:
+            train = bco_alpha if method == "bco-alpha" else adversarial
+            train(options, stage)
     known = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
     return load_network(run, known.get(method, file_of(method)), "baselines", options)
 
@@ -150,11 +150,8 @@ def file_of(method: str) -> str:
     return f"policy-{method}.safetensors"
 
 
-def bco_alpha(options: Options) -> Run:
+def bco_alpha(options: Options, stage: Stage) -> None:
     """Imitate anew, with labels of an inverse model that has learned from the policy's steps."""
-    stage = trained_by(options)
-    if stage.result is not None:
-        return stage.run
     run, world, section = stage.run, world_of(options), options.transitions
     demos = load_demonstrations(run)
     own = steps_of_policy(
@@ -176,7 +173,6 @@ def bco_alpha(options: Options) -> Run:
     seen, held_out = split_transitions(demos, report.actions, options.imitate.held_out)
     found = {"of": plain(options.baseline), "labels_changed": changed}
     imitate_transitions(options, stage, seen, held_out, file_of("bco-alpha"), **found)
-    return run
 
 
 def planned(options: Options) -> LCRL:
@@ -211,14 +207,9 @@ def trained_by(options: Options) -> Stage:
     return stage
 
 
-def adversarial(options: Options) -> Run:
+def adversarial(options: Options, stage: Stage) -> None:
     """Train a policy against a discriminator; see :mod:`ifo_grounding.baselines`."""
     method, section = options.method, options.baseline
-    if method == "gail+bc":
-        imitate_truth(options)
-    stage = trained_by(options)
-    if stage.result is not None:
-        return stage.run
     run, world = stage.run, world_of(options)
     begun = load_network(run, REFERENCE, "baselines", options) if method == "gail+bc" else None
     policy = new_policy(options, options.seed) if begun is None else begun
@@ -268,7 +259,6 @@ def adversarial(options: Options) -> Run:
     )
     save_network(run, file_of(method), policy)
     finish(options, stage, {"of": plain(section), **history[-1]}, history)
-    return run
 
 
 def access(options: Options, run: Run) -> Any:

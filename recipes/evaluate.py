@@ -92,11 +92,11 @@ def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[st
             f"nobody knows success in this world: ifo-grounding play run={options.run} shows it"
         )
     env = world.instructed(min(episodes, ROWS), device=options.device, **scenes)
-    how: dict[str, Any] = {"seed": scenes["seed"], "stream": scenes["stream"]}
     return env, {
         "episodes": episodes,
         "max_steps": options.evaluate.max_steps or UNTIL_THE_END,
-        **how,
+        "seed": scenes["seed"],
+        "stream": scenes["stream"],
     }
 
 

@@ -38,9 +38,9 @@ from ifo_grounding.training import Run
 class PlayOptions:
     """What is played."""
 
-    task: str = "move"
-    """With the networks that come with the package: ``move``, ``move-udlr``, ``pick``,
-    ``pick-out`` or ``pick-udlr``."""
+    task: str | None = None
+    """With the networks that come with the package: ``move``, where no ``run`` is named,
+    ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``."""
     run: str | None = None
     """A run whose networks are played, in its world; null takes those of the package."""
     host: str = "127.0.0.1"
@@ -59,7 +59,9 @@ class PlayOptions:
     """With ``to``: seed of the scenes."""
 
     def __post_init__(self) -> None:
-        check_choice("task", self.task, TASKS)
+        check_choice("task", self.task or "move", TASKS)
+        if self.task and self.run:
+            raise UserError("task= is for networks of the package: give it, or run=, not both")
         check_range(self, "scene", "seed", least=0, most=2**31)
         check_range(self, "port", least=1, most=65_535)
         if self.to is not None and Path(self.to).suffix.lower() != ".gif":
@@ -95,7 +97,7 @@ def play(options: PlayOptions) -> dict[str, Any]:
 
 def named(options: PlayOptions) -> str:
     """Return the name of the networks that are played."""
-    return options.run or f"{OWN}/{options.task}"
+    return options.run or f"{OWN}/{options.task or 'move'}"
 
 
 @functools.lru_cache(maxsize=8)

@@ -36,25 +36,6 @@ from ifo_grounding.report.results import conclusion, headline, meaning, restored
 from ifo_grounding.stats import Rate
 from ifo_grounding.training import Run
 
-CURVES = {
-    "imitate": ("How imitation learned", ["loss_imitation", "accuracy"]),
-    "train_instruction": (
-        "How the instruction classifier learned",
-        ["positive_probability", "negative_probability", "removed"],
-    ),
-    "train_goal": (
-        "How the goal classifier learned",
-        ["final_probability", "unfinished_probability"],
-    ),
-    "train_reward": (
-        "How the reward model learned",
-        ["positive_probability", "negative_probability"],
-    ),
-    "self_examine": (
-        "How self-examination went",
-        ["learned_return", "episode_length", "stopped", "entropy", "served_share", "clip_fraction"],
-    ),
-}
 AUDIT = {
     "Learned return and true success": {
         "audit_return": "learned return",
@@ -70,6 +51,26 @@ AUDIT = {
     "Entropy of the policy": {"entropy": "nats"},
 }
 """Reward hacking shows in the first panel: the learned return rises, and true success does not."""
+CURVES: dict[str, tuple[str, Any]] = {
+    "How imitation learned": ("imitate", ["loss_imitation", "accuracy"]),
+    "How the instruction classifier learned": (
+        "train_instruction",
+        ["positive_probability", "negative_probability", "removed"],
+    ),
+    "How the goal classifier learned": (
+        "train_goal",
+        ["final_probability", "unfinished_probability"],
+    ),
+    "How the reward model learned": (
+        "train_reward",
+        ["positive_probability", "negative_probability"],
+    ),
+    "How self-examination went": (
+        "self_examine",
+        ["learned_return", "episode_length", "stopped", "entropy", "served_share", "clip_fraction"],
+    ),
+    "Learned return and true success (validation scenes)": ("self_examine", AUDIT),
+}
 EPISODES, COMPARED, TRACED = 4, 3, 2
 TILE_SIZE = 32
 """Of a cell in animations, for people."""
@@ -164,14 +165,8 @@ def step_by_step(policy: Any, scenes: list[int], run: Run, options: Options) -> 
 
 def curves(run: Run) -> dict[str, Any]:
     """Plot what was logged, stage by stage; what was not finite was kept as null."""
-    found: dict[str, Any] = {}
-    for stage, (title, wanted) in CURVES.items():
-        if metrics := run.metrics(stage):
-            found[title] = training_curves(metrics, wanted)
-            if stage == "self_examine":
-                title = "Learned return and true success (validation scenes)"
-                found[title] = training_curves(metrics, AUDIT)
-    return found
+    logged = {title: (run.metrics(stage), panels) for title, (stage, panels) in CURVES.items()}
+    return {title: training_curves(*each) for title, each in logged.items() if each[0]}
 
 
 @recipe_main

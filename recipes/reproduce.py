@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.training import Run
-from ifo_grounding.training.checkpoint import leaves
+from ifo_grounding.training.checkpoint import leaves, written
 
 WANTED = {
     ("table", 1): (),  # a piece for each method
@@ -108,35 +108,18 @@ ConfigStore.instance().store(name="reproduce_options", node=ReproduceOptions)
 class Piece:
     """One call of a recipe that leaves one small file of results."""
 
-    run: str
-    arguments: tuple[str, ...]
+    call: Call
     file: Path
     base: str | None = None
     """The run that it begins with."""
-    recipe: str = "two_phase"
-    """The recipe that makes it."""
-
-    @property
-    def log(self) -> Path:
-        """Where its output goes."""
-        return home() / "runs" / f"{self.run}.log"
-
-    def call(self) -> Call:
-        """Return it as a call that a cluster takes."""
-        gpus = int("device=cpu" not in self.arguments)
-        return Call(self.recipe, self.arguments, self.run, self.log, gpus)
 
     def make(self) -> int:
         """Make it in a process of its own, on one thread."""
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        command = [
-            sys.executable,
-            str(Path(__file__).with_name(f"{self.recipe}.py")),
-            *self.arguments,
-        ]
-        with self.log.open("w") as log:
+        self.call.log.parent.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "ifo_grounding", "run", self.call.recipe]
+        with self.call.log.open("w") as log:
             return subprocess.run(
-                command,
+                [*command, *self.call.options],
                 env={**os.environ, "OMP_NUM_THREADS": "1"},
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -151,98 +134,85 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
         raise UserError("name a table=1, 2, 3 or 4, a figure=5 or 6, or levels=[GoToObj]")
     needed = {phase for key in asked for phase in WANTED[key]}
     phases = [phase for phase in options.phase if phase in needed]
-    chains = [
-        [piece(options, task, preset, n, seed, phase) for phase in phases]
-        for seed, n, preset, task in product(
-            options.seeds, options.demonstrations or [80_000], options.presets, options.tasks
-        )
-        if phases
-    ]
+
+    def runs(*numbers: int) -> Iterator[tuple[int, int, str, str]]:
+        demonstrations = options.demonstrations or numbers
+        return product(options.seeds, demonstrations, options.presets, options.tasks)
+
+    chains = []
+    if phases:
+        chains = [[of_phase(options, *run, phase) for phase in phases] for run in runs(80_000)]
     if options.table == 1:
-        numbers = options.demonstrations or [200, 2000, 20_000]
-        chains += [
-            list(of_methods(options, task, preset, n, seed))
-            for seed, n, preset, task in product(
-                options.seeds, numbers, options.presets, options.tasks
-            )
-        ]
+        chains += [list(of_methods(options, *run)) for run in runs(200, 2000, 20_000)]
     levels = product(options.seeds, options.demonstrations or [1000, 5000], options.levels)
-    return chains + [[of_level(options, level, n, seed)] for seed, n, level in levels]
+    return chains + [[of_level(options, *level)] for level in levels]
 
 
-def piece(
-    options: ReproduceOptions, task: str, preset: str, n: int, seed: int, phase: str
+def of_phase(
+    options: ReproduceOptions, seed: int, n: int, preset: str, task: str, phase: str
 ) -> Piece:
     """Return the piece of one phase."""
     name = f"tables-{task}-{n}-{preset}-{{}}-seed{seed}"
-    first = FIRST.get(phase)
-    chosen = [
-        {"task": task, "preset": preset, "seed": seed, "demonstrations": {"n": n}},
-        {"variant": phase, **({"base": name.format(first)} if first else {})},
+    base = name.format(FIRST[phase]) if phase in FIRST else None
+    return piece(
+        options,
+        name.format(phase),
+        f"tables/{task}-{n}-{preset}-{phase}-seed{seed}.json",
+        {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n},
+        {"variant": phase, **({"base": base} if base else {})},
         options.all,
         options.preset[preset],
         options.preset_of_task.get(preset, {}).get(task, {}),
         options.phase[phase],
-    ]
-    file = f"tables/{task}-{n}-{preset}-{phase}-seed{seed}.json"
-    base = name.format(first) if first else None
-    return call(options, name.format(phase), chosen, file, base)
+        base=base,
+    )
 
 
 def of_methods(
-    options: ReproduceOptions, task: str, preset: str, n: int, seed: int
+    options: ReproduceOptions, seed: int, n: int, preset: str, task: str
 ) -> Iterator[Piece]:
     """Yield a piece for each method of Table 1, of one run, or for each trial, of a run each."""
     name = f"{task}-{n}-{preset}"
-    chosen: list[Mapping[str, Any]] = [
-        {"task": task, "preset": preset, "seed": seed, "demonstrations": {"n": n}},
-        options.method,
-    ]
-    left_out = () if task in PLANNED else ("lc-rl",)
-    if not options.tune:
-        for method in (method for method in METHODS if method not in left_out):
-            file = f"baselines/{name}-{method}-seed{seed}.json"
-            run = f"baselines-{name}-seed{seed}"
-            yield replace(
-                call(options, run, [*chosen, {"method": method}], file, None), recipe="baselines"
-            )
-        return
-    spaces = {method: of for method, of in options.tuning.items() if method not in left_out}
-    for method, space in spaces.items():
+    of_run = {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n, **options.method}
+    for method in options.tuning if options.tune else METHODS:
+        if method == "lc-rl" and task not in PLANNED:
+            continue
+        if not options.tune:
+            run, file = f"baselines-{name}-seed{seed}", f"baselines/{name}-{method}-seed{seed}.json"
+            yield piece(options, run, file, of_run, {"method": method}, recipe="baselines")
+            continue
+        space = options.tuning[method]
         for number, values in enumerate(product(*space.values())):
-            trial = dict(zip(space, values, strict=True))
-            of_trial = {"method": method, "variant": f"trial{number}"}
-            file = f"tuning/{name}-trial{number}-{method}-seed{seed}.json"
             run = f"tuning-{name}-{method}-{number}-seed{seed}"
-            made = call(options, run, [*chosen, options.tuned, of_trial, trial], file, None)
-            yield replace(made, recipe="baselines")
+            file = f"tuning/{name}-trial{number}-{method}-seed{seed}.json"
+            trial = {"method": method, "variant": f"trial{number}"}
+            trial |= zip(space, values, strict=True)
+            yield piece(options, run, file, of_run, options.tuned, trial, recipe="baselines")
 
 
-def of_level(options: ReproduceOptions, level: str, n: int, seed: int) -> Piece:
+def of_level(options: ReproduceOptions, seed: int, n: int, level: str) -> Piece:
     """Return the piece of one level of BabyAI."""
-    preset = options.level["preset"]
-    chosen: list[Mapping[str, Any]] = [
-        {"world": "babyai", "level": level, "seed": seed, "demonstrations": {"n": n}},
-        options.level,
-    ]
-    name = f"{level}-{n}-{preset}-seed{seed}"
-    return call(options, f"levels-{name}", chosen, f"babyai/{name}.json", None)
+    of_run = {"world": "babyai", "level": level, "seed": seed, "demonstrations.n": n}
+    name = f"{level}-{n}-{options.level['preset']}-seed{seed}"
+    return piece(options, f"levels-{name}", f"babyai/{name}.json", of_run, options.level)
 
 
-def call(
+def piece(
     options: ReproduceOptions,
     run: str,
-    chosen: list[Mapping[str, Any]],
     file: str,
-    base: str | None,
+    *chosen: Mapping[str, Any],
+    base: str | None = None,
+    recipe: str = "two_phase",
 ) -> Piece:
     """Return the piece of some options, later ones first where they differ."""
     path = Path(options.results) / file
     given = {"run": run, "results": str(path.parent), "device": options.device}
     for section in chosen:
         given |= leaves(section)
-    arguments = (f"{name}={'null' if value is None else value}" for name, value in given.items())
-    return Piece(run, tuple(arguments), path, base)
+    words = tuple(f"{name}={written(value)}" for name, value in given.items())
+    log = home() / "runs" / f"{run}.log"
+    return Piece(Call(recipe, words, run, log, gpus=int(given["device"] != "cpu")), path, base)
 
 
 def to_make(chain: list[Piece]) -> list[Piece]:
@@ -252,9 +222,9 @@ def to_make(chain: list[Piece]) -> list[Piece]:
     whose run is not there.
     """
     missing = [piece for piece in chain if not piece.file.exists()]
-    bases = {piece.base for piece in missing if Run(piece.run).options() is None}
+    bases = {piece.base for piece in missing if Run(piece.call.run).options() is None}
     gone = {base for base in bases if base and not Run(base).record("evaluate")}
-    return [piece for piece in chain if piece in missing or piece.run in gone]
+    return [piece for piece in chain if piece in missing or piece.call.run in gone]
 
 
 def reproduce(options: ReproduceOptions) -> list[Piece]:
@@ -264,33 +234,31 @@ def reproduce(options: ReproduceOptions) -> list[Piece]:
         for piece in (piece for chain in chains for piece in chain):
             print("done   " if piece.file.exists() else "not run", piece.file)
         return []
-    failed: list[Piece] = []
     missing = [to_make(chain) for chain in chains]
     if options.ray:
-        made = {piece.call(): piece for chain in missing for piece in chain}
-        calls = [[piece.call() for piece in chain] for chain in missing]
+        made = {piece.call: piece for chain in missing for piece in chain}
+        calls = [[piece.call for piece in chain] for chain in missing]
         return [made[call] for call in run_on_cluster(calls, options.progress)]
     with (
         tqdm(total=sum(map(len, missing)), unit="piece", disable=not options.progress) as bar,
         ThreadPoolExecutor(options.jobs) as pool,
     ):
 
-        def run(chain: list[Piece]) -> None:
+        def failed(chain: list[Piece]) -> Piece | None:
             for piece in chain:
                 bar.set_postfix_str(piece.file.stem)
                 if piece.make():
-                    failed.append(piece)
-                    return
+                    return piece
                 bar.update()
+            return None
 
-        list(pool.map(run, missing))
-    return failed
+        return [piece for piece in pool.map(failed, missing) if piece]
 
 
 @recipe_main
 def main(options: ReproduceOptions) -> None:
     if failed := reproduce(options):
-        listed = ", ".join(str(piece.log) for piece in failed)
+        listed = ", ".join(str(piece.call.log) for piece in failed)
         raise UserError(f"pieces that ended with an error left the rest of their chains: {listed}")
 
 

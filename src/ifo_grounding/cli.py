@@ -138,12 +138,10 @@ def resolve(command: str, rest: Sequence[str]) -> tuple[str, list[str]]:
     >>> resolve("demo", ["task=pick"])
     ('two_phase', ['task=pick'])
     """
-    options = list(rest)
+    check_choice("command", command, [*COMMANDS, "run"])
+    options, names = list(rest), recipe_names()
     if command in COMMANDS:
         return COMMANDS[command][0], options
-    if command != "run":
-        check_choice("command", command, [*COMMANDS, "run"])
-    names = recipe_names()
     if not options:
         raise UserError(f"which recipe? choose one of {', '.join(names)}")
     recipe = options.pop(0).removesuffix(".py")

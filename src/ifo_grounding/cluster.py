@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,14 +114,11 @@ def _run(call: Call, folder: str, _before: None) -> None:
 
     os.chdir(folder)
     for _ in range(LOCKED):
-        with contextlib.suppress(UserError), Run(call.run).lock():
+        with suppress(UserError), Run(call.run).lock():
             break
         time.sleep(1)
     call.log.parent.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as stack:
-        log = stack.enter_context(call.log.open("w"))
-        stack.enter_context(contextlib.redirect_stdout(log))
-        stack.enter_context(contextlib.redirect_stderr(log))
+    with call.log.open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:
             run_recipe(call.recipe, call.options)
         except SystemExit as ended:

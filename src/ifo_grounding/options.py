@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import inspect
 import itertools
-import json
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -28,7 +28,7 @@ from ifo_grounding.data.lerobot import INFO
 from ifo_grounding.data.pictures import LIST, read_list
 from ifo_grounding.errors import UserError, did_you_mean
 from ifo_grounding.files import read_json
-from ifo_grounding.training.checkpoint import leaves
+from ifo_grounding.training.checkpoint import leaves, written
 from ifo_grounding.training.run import Run
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
@@ -87,9 +87,13 @@ def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
     with _composing(script.parent):
         jobs = words_of_jobs(arguments)
         if own:
-            texts = texts_of(OmegaConf.get_type(compose(script.stem)))
+            known = compose(script.stem)
+            texts = texts_of(OmegaConf.get_type(known))
             given = [[quoted(word, texts, comma="text") for word in job] for job in jobs]
-            return [OmegaConf.to_object(compose(script.stem, job)) for job in given]
+            composed = [compose(script.stem, job) for job in given]
+            for each in composed:
+                _refuse_unknown(known, each)
+            return [OmegaConf.to_object(each) for each in composed]
         return [_settled(job) for job in jobs]
 
 
@@ -127,12 +131,9 @@ def quoted(word: str, texts: Mapping[str, str] = TEXTS, comma: str = "unclear") 
         as_it_is |= "${" in value or bool(calls)
     if as_it_is:
         return word
-    escaped = []
-    for part in value.split(",") if comma == "parts" else [value]:
-        text = str(Path(part).expanduser()) if part.startswith("~/") else part
-        quotes = re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", r"\'"), text)
-        escaped.append(f"'{quotes}'")
-    return f"{name}={','.join(escaped)}"
+    parts = value.split(",") if comma == "parts" else [value]
+    full = [str(Path(part).expanduser()) if part.startswith("~/") else part for part in parts]
+    return f"{name}={','.join(QuotedString(each, Quote.single).with_quotes() for each in full)}"
 
 
 def _combinations(words: Sequence[str]) -> list[list[str]]:
@@ -162,7 +163,7 @@ def _settled(overrides: Sequence[str]) -> Options:
     known = few if isinstance(n, int) and n < FEW else [] if counted else ["budget=demo"]
     words += [f"~hydra/{group}" for group in UNREAD if "hydra" not in " ".join(named)]
     cfg = compose(CONFIG, words + known * free)
-    _refuse_unknown(cfg)
+    _refuse_unknown(leaves(plain(Options())), leaves(plain(cfg)))
     number = _demonstrations(cfg)
     if free and not known and number < FEW:
         cfg = compose(CONFIG, words + few)
@@ -226,14 +227,11 @@ def plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
 
 
-def _refuse_unknown(cfg: DictConfig) -> None:
-    """Refuse what ``+name=`` added to the options, and what ``~name`` removed."""
-    trees: Any = plain(Options()), OmegaConf.to_container(cfg)
-    known, given = (
-        {name for name in leaves(tree) if not name.startswith("world")} for tree in trees
-    )
-    for name in sorted(known ^ given):
-        raise UserError(f"option {name} cannot be added or removed{did_you_mean(name, known)}")
+def _refuse_unknown(known: Mapping[Any, Any], given: Mapping[Any, Any]) -> None:
+    """Refuse what ``+name=`` added to known options, but for a world's, and ``~name`` removed."""
+    for name in sorted(known.keys() ^ given.keys()):
+        if not name.startswith("world"):
+            raise UserError(f"option {name} cannot be added or removed{did_you_mean(name, known)}")
 
 
 def explained(error: Exception) -> UserError:
@@ -298,15 +296,6 @@ def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[s
         fits = len(text) <= 36
         yield f"  {text:<36}  {meaning[0]}".rstrip() if fits else f"  {text}"
         yield from (f"{'':<40}{more}" for more in meaning[fits:])
-
-
-def written(value: Any) -> str:
-    """Write a value as it is given on a command line.
-
-    >>> written(None), written(True), written("pick"), written([1, 2])
-    ('null', 'true', 'pick', '[1, 2]')
-    """
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def field_docs(kind: type) -> dict[str, str]:

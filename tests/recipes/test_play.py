@@ -61,6 +61,8 @@ def test_the_networks_of_a_run_are_played(played, phase_1):
         (["port=70000"], "port must be at most 65535"),
         (["task=fly"], "unknown task 'fly'"),
         (["level=3"], "level"),
+        (["+level=3"], "option level cannot be added"),
+        (["task=pick", "run=mine"], "not both"),
     ],
 )
 def test_what_cannot_be_played_is_said_in_one_line(words, said, capsys):

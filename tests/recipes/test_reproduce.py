@@ -42,7 +42,7 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(
     from two_phase import two_phase
 
     def make_here(piece):
-        two_phase(options_of(*piece.arguments))
+        two_phase(options_of(*piece.call.options))
 
     monkeypatch.setattr(Piece, "make", make_here)  # not in a process of its own
 
@@ -59,7 +59,7 @@ def test_pieces_are_made_once_and_stand_on_the_same_phase_1(
     assert to_make([first, second]) == []
     # Where results came along and runs did not, what builds on phase 1 needs it again.
     for piece in (first, second):
-        shutil.rmtree(tmp_path / "runs" / piece.run)
+        shutil.rmtree(tmp_path / "runs" / piece.call.run)
     assert to_make([first, second]) == []
     second.file.unlink()
     assert to_make([first, second]) == [first, second]
@@ -72,8 +72,8 @@ def test_every_piece_is_a_call_that_demo_takes(reproduce_options, asked):
     chains = pieces(reproduce_options(asked))
     assert len(chains) == (2 if "levels" in asked else 10)
     for piece in (chains[0][-1], chains[-1][-1]):
-        options = options_of(*piece.arguments)
-        assert options.run == piece.run
+        options = options_of(*piece.call.options)
+        assert options.run == piece.call.run
         assert options.demonstrations.n == 80_000 or "levels" in asked
         assert (options.base is None) == (piece.base is None)
 
@@ -100,7 +100,7 @@ def test_a_piece_that_fails_is_named_and_leaves_the_rest_of_its_chain(reproduce_
 
     failed = reproduce(reproduce_options("figure=6", *TINY, "+all.imitate.lr=-1.0"))
     assert len(failed) == 1
-    assert "imitate: lr must be above 0" in failed[0].log.read_text()
+    assert "imitate: lr must be above 0" in failed[0].call.log.read_text()
 
 
 def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_path):
@@ -111,12 +111,14 @@ def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_pa
     asked = reproduce_options("table=1", "tasks=[move,pick]", "presets=[strong]", "seeds=[3]")
     chains = pieces(asked)
     assert len(chains) == 2 * 3  # tasks, numbers of demonstrations
-    assert {piece.recipe for chain in chains for piece in chain} == {"baselines"}
+    assert {piece.call.recipe for chain in chains for piece in chain} == {"baselines"}
     for chain, budget in ((chains[0], "few"), (chains[-1], "many")):
-        named = [word for piece in chain for word in piece.arguments if word.startswith("method=")]
-        left_out = "" if "task=move" in chain[0].arguments else "lc-rl"  # which cannot plan pick
+        named = [
+            word for piece in chain for word in piece.call.options if word.startswith("method=")
+        ]
+        left_out = "" if "task=move" in chain[0].call.options else "lc-rl"  # which cannot plan pick
         assert named == [f"method={method}" for method in METHODS if method != left_out]
-        first, last = (options_of(*piece.arguments) for piece in (chain[0], chain[-1]))
+        first, last = (options_of(*piece.call.options) for piece in (chain[0], chain[-1]))
         assert first.run == last.run and first.seed == 3
         assert (first.budget, first.evaluate.episodes) == (budget, 5000)
     assert chains[0][0].file == tmp_path / "results/baselines/move-200-strong-bc-seed3.json"
@@ -131,18 +133,20 @@ def test_every_method_of_table_1_is_tuned_by_as_many_trials(reproduce_options):
     (of_strong, _) = pieces(asked)
     trials: dict[str, list] = {method: [] for method in METHODS}
     for piece in of_strong:
-        given = dict(word.split("=", 1) for word in piece.arguments)
+        given = dict(word.split("=", 1) for word in piece.call.options)
         trials[given["method"]].append(given)
     counts = {method: len(each) for method, each in trials.items()}
     assert counts == dict.fromkeys(METHODS, 6) | {"random": 0, "expert": 0}
-    assert len({each.run for each in of_strong}) == len({each.file for each in of_strong}) == 60
-    assert all("evaluate.stream=validation" in piece.arguments for piece in of_strong)
+    assert (
+        len({each.call.run for each in of_strong}) == len({each.file for each in of_strong}) == 60
+    )
+    assert all("evaluate.stream=validation" in piece.call.options for piece in of_strong)
     of_gail = {(float(t["baseline.lr"]), int(t["baseline.steps"])) for t in trials["gail"]}
     assert of_gail == {(lr, steps) for lr in (3e-4, 1e-3, 3e-3) for steps in (10, 30)}
     taken: set[str] = set()  # every value of every method
     for piece in of_strong:
-        words = {word for word in piece.arguments if not word.startswith(("run=", "variant="))}
+        words = {word for word in piece.call.options if not word.startswith(("run=", "variant="))}
         if not words <= taken:
-            options = options_of(*piece.arguments)
-            assert (options.run, options.evaluate.stream) == (piece.run, "validation")
+            options = options_of(*piece.call.options)
+            assert (options.run, options.evaluate.stream) == (piece.call.run, "validation")
         taken |= words

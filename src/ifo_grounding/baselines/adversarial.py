@@ -80,8 +80,10 @@ class DiscriminatorLoss(SupervisedLoss):
                 "policy_probability": self._mean(wrong.sigmoid()),
             }
             if self.swapped:
-                other, differs = swap_instructions(demonstrations)
-                elsewhere = self._logits(other[differs])
+                own = demonstrations[keys.INSTRUCTION]
+                other = own.roll(1, 0)  # that of the row before
+                swapped = demonstrations.copy().set(keys.INSTRUCTION, other)
+                elsewhere = self._logits(swapped[(own != other).any(-1)])
                 if len(elsewhere):
                     negative = (negative + F.softplus(elsewhere).mean()) / 2
                     found["swapped_probability"] = self._mean(elsewhere.sigmoid())
@@ -96,13 +98,6 @@ class DiscriminatorLoss(SupervisedLoss):
             return torch.zeros(0)
         read = batch.select(*self.network.in_keys)
         return self.network(read).get(self.output).reshape(-1).float()
-
-
-def swap_instructions(batch: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-    """Return a batch [N] with the instruction of the row before, and where that is another one."""
-    own = batch[keys.INSTRUCTION]
-    other = own.roll(1, 0)
-    return batch.copy().set(keys.INSTRUCTION, other), (own != other).any(-1)
 
 
 class DiscriminatorReward(RewardTransform):

@@ -94,17 +94,14 @@ def walk(env: EnvBase, scenes: Tensor, size: int) -> tuple[Tensor, Tensor]:
         return state[keys.PIXELS]
 
     for action in [UP] * (size - 1) + [LEFT] * (size - 1):
-        corner = go(action)
-    frames = corner.new_empty(len(corner), size * size, *corner.shape[1:])
-    frames[:, 0] = corner
-    row, column, there = 0, 0, RIGHT
-    for _ in range(size * size - 1):
-        at_edge = column == (size - 1 if there == RIGHT else 0)
-        if at_edge:
-            row, there, action = row + 1, LEFT if there == RIGHT else RIGHT, DOWN
-        else:
-            column, action = column + (1 if there == RIGHT else -1), there
-        frames[:, row * size + column] = go(action)
+        seen = go(action)
+    frames = seen.new_empty(len(seen), size * size, *seen.shape[1:])
+    for row, cells in enumerate(torch.arange(size * size).view(size, size)):
+        along, path = (RIGHT, cells) if row % 2 == 0 else (LEFT, cells.flip(0))
+        for place, cell in enumerate(path):
+            if row or place:  # the walk begins in the first cell
+                seen = go(along if place else DOWN)
+            frames[:, cell] = seen
     return frames[: len(scenes)], instruction[: len(scenes)]
 
 

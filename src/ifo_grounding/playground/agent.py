@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import torch
@@ -241,10 +242,8 @@ class Agent:
         if self.value is not None:
             with evaluating(self.value):
                 words = tokens.expand(len(frames) - 1, -1)
-                seen = {keys.PIXELS: frames[:-1], keys.INSTRUCTION: words}
-                values = (
-                    self.value(TensorDict(seen, [len(words)]))[keys.STATE_VALUE].flatten().tolist()
-                )
+                seen = TensorDict({keys.PIXELS: frames[:-1], keys.INSTRUCTION: words}, [len(words)])
+                values = self.value(seen)[keys.STATE_VALUE].flatten().tolist()
         return Played(trace, states, values, fulfilled, episode.success if judged else None)
 
     def _judges(self, tokens: Tensor) -> bool:
@@ -266,26 +265,17 @@ class Agent:
         if state is None:
             self._env.reset(TensorDict({keys.SCENE: torch.tensor([[scene]])}, [1]))
             state = self._env.truth.state.clone()
-        states = [state]
-        for action in actions:
-            states.append(step(states[-1], torch.tensor([action])))
-        return states
+        return list(accumulate(torch.as_tensor(actions).unsqueeze(-1), step, initial=state))
 
     def _asked(
         self, network: Any, tokens: Tensor, frame: Tensor, first: Tensor | None = None
     ) -> Tensor:
         """Return the probability that a classifier gives sentences [N, L] at a frame, [N]."""
-        seen = {
-            keys.PIXELS: frame.expand(len(tokens), *frame.shape),
-            keys.INSTRUCTION: tokens,
-            keys.INITIAL_PIXELS: (frame if first is None else first).expand(
-                len(tokens), *frame.shape
-            ),
-        }
+        shown = {keys.PIXELS: frame, keys.INITIAL_PIXELS: frame if first is None else first}
+        seen = TensorDict(shown).expand(len(tokens)).set(keys.INSTRUCTION, tokens)
         with evaluating(network):
-            read = TensorDict(seen, [len(tokens)]).select(*network.in_keys)
             written = output_key(network, keys.SUITABILITY, keys.GOAL_SCORE)
-            return network(read)[written].sigmoid().flatten()
+            return network(seen.select(*network.in_keys))[written].sigmoid().flatten()
 
 
 def told(policy: Any, tokens: Tensor) -> Callable[[TensorDictBase], TensorDictBase]:

@@ -59,6 +59,7 @@ KEYS = {
     **{"forward": "ArrowUp", "pick or place": " ", "pickup": " ", "stop": "Enter", "done": "Enter"},
 }
 """Keys of a keyboard, by what an action is called."""
+SIGNS = {" ": "space", "ArrowUp": "↑", "ArrowRight": "→", "ArrowDown": "↓", "ArrowLeft": "←"}
 
 
 def action_words(actions: Sequence[str]) -> list[str]:
@@ -204,8 +205,7 @@ def pad(frame: np.ndarray, steps: int, actions: Sequence[str]) -> str:
     buttons = []
     for number, name in enumerate(action_words(actions)):
         key = KEYS.get(name, str(number + 1))
-        named = {" ": "space", "ArrowUp": "↑", "ArrowRight": "→"}.get(key, key)
-        named = {"ArrowDown": "↓", "ArrowLeft": "←"}.get(named, named)
+        named = SIGNS.get(key, key)
         buttons.append(
             f'<button data-act="{number}" data-key="{escape(key)}" title="key: {escape(named)}">'
             f"{escape(name)} <small>{escape(named)}</small></button>"

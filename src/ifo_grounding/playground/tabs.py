@@ -54,7 +54,6 @@ class Tab(NamedTuple):
 
 def watch_tab(source: Source, visit: Any) -> Tab:
     """Watch and talk."""
-    quiet = IN_TURN
     with gradio.Row():
         name = gradio.Dropdown(list(source.names), label="Networks")
         scene = gradio.Number(0, label="Scene", precision=0, minimum=0)
@@ -110,7 +109,7 @@ def watch_tab(source: Source, visit: Any) -> Tab:
     moved = [at, boards]
 
     def on(event: Any, action: Callable[..., Any], *given: Any) -> None:
-        event(does(action, draw), [visit, *given], shown, **quiet)
+        event(does(action, draw), [visit, *given], shown, **IN_TURN)
 
     on(name.input, Visit.choose, name)
     on(scene.submit, Visit.go, scene, seed)
@@ -124,27 +123,27 @@ def watch_tab(source: Source, visit: Any) -> Tab:
         [completions, status],
         **{**IN_TURN, "trigger_mode": "always_last"},
     )
-    completions.click(lambda row: row[0], completions, sentence, **quiet).then(
-        does(Visit.tell, draw), [visit, sentence], shown, **quiet
+    completions.click(lambda row: row[0], completions, sentence, **IN_TURN).then(
+        does(Visit.tell, draw), [visit, sentence], shown, **IN_TURN
     )
 
     def clicked(visit: Visit, event: gradio.EventData) -> list[Any]:
         return does(Visit.click, draw)(visit, int(event.cell))
 
-    boards.click(clicked, visit, shown, **quiet)
-    tool.input(does(Visit.hold, step_drawn), [visit, tool], moved, **quiet)
+    boards.click(clicked, visit, shown, **IN_TURN)
+    tool.input(does(Visit.hold, step_drawn), [visit, tool], moved, **IN_TURN)
 
     def at_step(visit: Visit, value: float) -> None:
-        visit.at = min(max(int(value), 0), visit.steps)
+        visit.step(int(value) - visit.at)
 
     def to_look(visit: Visit, value: bool) -> None:
         visit.looks = bool(value)
 
-    at.release(does(at_step, step_drawn), [visit, at], moved, queue=False, **quiet)
-    looks.input(does(to_look, step_drawn), [visit, looks], moved, queue=False, **quiet)
+    at.release(does(at_step, step_drawn), [visit, at], moved, queue=False, **IN_TURN)
+    looks.input(does(to_look, step_drawn), [visit, looks], moved, queue=False, **IN_TURN)
     for button, by in ((back, -1), (forth, 1)):
         move = does(lambda visit, by=by: visit.step(by), step_drawn)
-        button.click(move, visit, moved, queue=False, **quiet)
+        button.click(move, visit, moved, queue=False, **IN_TURN)
 
     def ticked(visit: Visit) -> list[Any]:
         visit.step(1)
@@ -158,9 +157,9 @@ def watch_tab(source: Source, visit: Any) -> Tab:
         return [*step_drawn(visit), "Pause", gradio.Timer(1 / speed, active=True)]
 
     running = [*moved, play, timer]
-    timer.tick(ticked, visit, running, queue=False, **quiet)
-    play.click(toggled, [visit, play, speed], running, **quiet)
-    speed.release(lambda speed: gradio.Timer(1 / speed), speed, timer, **quiet)
+    timer.tick(ticked, visit, running, queue=False, **IN_TURN)
+    play.click(toggled, [visit, play, speed], running, **IN_TURN)
+    speed.release(lambda speed: gradio.Timer(1 / speed), speed, timer, **IN_TURN)
     return Tab(draw, shown)
 
 
@@ -183,7 +182,6 @@ def _suits(visit: Visit, sentence: str) -> str:
 
 def teach_tab(visit: Any) -> Tab:
     """Teach by showing."""
-    quiet = IN_TURN
     gradio.Markdown(
         "Say what you will show, then show it with the buttons or the keys, and stop. What is kept "
         "are the pictures and your sentence, never what you pressed. Invent a task that nobody "
@@ -263,20 +261,19 @@ def teach_tab(visit: Any) -> Tab:
     def finished(visit: Visit, said: str) -> None:
         visit.lesson.finish(said)
 
-    board.click(pressed, [visit, sentence], shown, **quiet)
-    listed.click(looked, visit, shown, **quiet)
-    drop.click(does(dropped, draw), [visit, chosen], shown, **quiet)
-    again.click(does(lambda visit: visit.lesson.begin(), draw), visit, shown, **quiet)
-    done.click(does(finished, draw), [visit, sentence], shown, **quiet)
-    save.click(does(Visit.archive, saved), [visit, form], [file, status], **quiet)
-    train.click(does(Visit.train, draw), visit, shown, **quiet)
-    timer.tick(trained, visit, [progress, timer], **quiet)
+    board.click(pressed, [visit, sentence], shown, **IN_TURN)
+    listed.click(looked, visit, shown, **IN_TURN)
+    drop.click(does(dropped, draw), [visit, chosen], shown, **IN_TURN)
+    again.click(does(lambda visit: visit.lesson.begin(), draw), visit, shown, **IN_TURN)
+    done.click(does(finished, draw), [visit, sentence], shown, **IN_TURN)
+    save.click(does(Visit.archive, saved), [visit, form], [file, status], **IN_TURN)
+    train.click(does(Visit.train, draw), visit, shown, **IN_TURN)
+    timer.tick(trained, visit, [progress, timer], **IN_TURN)
     return Tab(draw, shown, show)
 
 
 def look_tab(visit: Any) -> None:
     """Look at recordings."""
-    quiet = IN_TURN
     folder = gradio.Textbox(
         label="Folder of demonstrations: saved ones, pictures, or LeRobot's",
         submit_btn="Look",
@@ -297,4 +294,4 @@ def look_tab(visit: Any) -> None:
 
     shown = [status, film, listed]
     folder.submit(does(Visit.open, draw), [visit, folder], shown)
-    listed.click(chosen, visit, shown, **quiet)
+    listed.click(chosen, visit, shown, **IN_TURN)

@@ -152,7 +152,8 @@ class Lesson:
         """
         check_choice("form", form, FORMS)
         demos = self.demonstrations()
-        folder = home() / "taught" / f"{_name(self.episodes[0].sentence)}-{uuid.uuid4().hex[:8]}"
+        name = re.sub("[^a-z0-9]+", "-", self.episodes[0].sentence).strip("-")[:40] or "taught"
+        folder = home() / "taught" / f"{name}-{uuid.uuid4().hex[:8]}"
         if form == "demonstrations":
             demos.save(folder)
         elif form == "lerobot":
@@ -207,16 +208,10 @@ class Training:
         """Share of the stages that are done."""
         if self.process.poll() == 0:
             return 1.0
-        records = self.run.records() if self.run.folder.is_dir() else {}
-        return sum(name in records for name in STAGES) / len(STAGES)
+        return len(self.run.records().keys() & {*STAGES}) / len(STAGES)
 
     @property
     def now(self) -> str:
         """The last line that it printed; of one that failed, why."""
         lines = self.said.read_text(errors="replace").splitlines()
         return one_line(lines[-1]) if lines else "beginning"
-
-
-def _name(sentence: str) -> str:
-    """Return what names a folder: the letters and digits of a sentence."""
-    return re.sub("[^a-z0-9]+", "-", sentence.lower()).strip("-")[:40] or "taught"

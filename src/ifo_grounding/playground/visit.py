@@ -127,7 +127,7 @@ class Visit:
         """Put what the tool says into a cell, or take away what is there."""
         if self.tool == LOOK or not self.agent.arranges:
             return
-        state = self._begun().clone()
+        state = self._first.states[0].clone()
         if self.tool == ARM:
             state.arm[0] = cell
         elif self.tool == CLEAR:
@@ -147,9 +147,6 @@ class Visit:
         self.played = self.agent.play(scene, seed, sentence, state)
         self.scene, self.seed, self.sentence, self.state = scene, seed, sentence, state
         self.at = 0
-
-    def _begun(self) -> WorldState:
-        return self._first.states[0]
 
     @property
     def _first(self) -> Played:
@@ -176,7 +173,7 @@ class Visit:
 
     def suited(self, sentence: str) -> Suited:
         """Say whether a sentence suits the scene."""
-        state = self._begun() if self.agent.arranges else None
+        state = self._first.states[0] if self.agent.arranges else None
         return self.agent.suits(sentence, self.frame, self.scene, self.seed, state)
 
     def boards(self) -> str:

@@ -41,7 +41,7 @@ def difference(
         if there == here or any(f"{name}.".startswith(f"{each}.") for each in free):
             continue
         if name in before and name in now:
-            return f"made with {name}={_written(there)}, not {_written(here)}: leave it out"
+            return f"made with {name}={written(there)}, not {written(here)}: leave it out"
         version = f"with {name}" if name in before else f"without {name}"
         return f"made by another version, {version}: install that one"
     return None
@@ -58,8 +58,12 @@ def leaves(settings: Mapping[str, Any], section: str = "") -> dict[str, Any]:
     return found
 
 
-def _written(value: Any) -> str:
-    """Return a value as it is written on a command line."""
+def written(value: Any) -> str:
+    """Return a value as it is written on a command line.
+
+    >>> written(None), written(True), written("pick"), written([1, 2])
+    ('null', 'true', 'pick', '[1, 2]')
+    """
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
