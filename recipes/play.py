@@ -59,7 +59,7 @@ class PlayOptions:
     """With ``to``: seed of the scenes."""
 
     def __post_init__(self) -> None:
-        check_choice("task", self.task or "move", TASKS)
+        check_choice("task", "move" if self.task is None else self.task, TASKS)
         if self.task and self.run:
             raise UserError("task= is for networks of the package: give it, or run=, not both")
         check_range(self, "scene", "seed", least=0, most=2**31)

@@ -39,6 +39,8 @@ def sections():
         ("task=a,b", "several values need --multirun"),
         ("+imitate.stepz=1", r"imitate.stepz cannot be added .*did you mean 'imitate.steps'"),
         ("~imitate", "option imitate.batch_size cannot be added or removed"),
+        ("~seed", "option seed cannot be added or removed"),
+        ("networks.features=5000", "networks: features must be at most 4096"),
         ("run=/", "run needs a name"),
         ("networks.features=2147483647", "networks: features must be at most"),
         ("networks.sentence_pooling=first", "networks: unknown sentence_pooling 'first'"),

@@ -139,9 +139,10 @@ def resolve(command: str, rest: Sequence[str]) -> tuple[str, list[str]]:
     ('two_phase', ['task=pick'])
     """
     check_choice("command", command, [*COMMANDS, "run"])
-    options, names = list(rest), recipe_names()
+    options = list(rest)
     if command in COMMANDS:
         return COMMANDS[command][0], options
+    names = recipe_names()
     if not options:
         raise UserError(f"which recipe? choose one of {', '.join(names)}")
     recipe = options.pop(0).removesuffix(".py")

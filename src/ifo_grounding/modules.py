@@ -24,7 +24,7 @@ TURNS = threading.RLock()
 
 @contextlib.contextmanager
 def in_mode(training: bool, module: object) -> Iterator[None]:
-    """Run a block with a module in train or eval mode; every submodule gets its own mode back."""
+    """Run a block with a module in train or eval mode; what this switched gets its mode back."""
     parts = module.modules() if isinstance(module, nn.Module) else ()
     with TURNS:
         switched = [part for part in parts if part.training is not training]

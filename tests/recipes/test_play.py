@@ -62,6 +62,8 @@ def test_the_networks_of_a_run_are_played(played, phase_1):
         (["task=fly"], "unknown task 'fly'"),
         (["level=3"], "level"),
         (["+level=3"], "option level cannot be added"),
+        (["+worldly=3"], "option worldly cannot be added"),
+        (["task="], "unknown task"),
         (["task=pick", "run=mine"], "not both"),
     ],
 )

@@ -90,8 +90,9 @@ class DiscriminatorLoss(SupervisedLoss):
         loss = (F.softplus(-right).mean() + negative) / 2
         return TensorDict({"loss_discriminator": loss, **found})
 
-    adversarial = forward
-    """As :class:`~ifo_grounding.training.AdversarialUpdates` asks for it."""
+    def adversarial(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
+        """Compute it as :class:`~ifo_grounding.training.AdversarialUpdates` asks for it."""
+        return self.forward(demonstrations, policy)
 
     def _logits(self, batch: TensorDictBase) -> Tensor:
         if not len(batch):

@@ -77,8 +77,9 @@ def load_folder(
     folder = Path(folder)
     if not (folder / META).is_file():
         raise UserError(f"{folder} is not a folder of {kind}: it has no {META}")
-    meta = read_json(folder / META, dict)
-    if (found := meta.get("format")) != kind:
+    meta = read_json(folder / META)
+    found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
+    if found != kind:
         raise UserError(f"{folder} holds {found!r}, not {kind!r}")
     if meta.get("version") != VERSION:
         raise UserError(

@@ -10,14 +10,14 @@ from torch import Tensor
 from ifo_grounding.data.codec import FrameCodec
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.truth import Truth
-from ifo_grounding.errors import at_least_one
+from ifo_grounding.errors import at_least_one, check_choice
 from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import derive, generator
 from ifo_grounding.tasks import expert
 from ifo_grounding.tasks.scenes import Scene, SceneOptions, draw_scenes
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.world import step
-from ifo_grounding.world.tiles import tile_index, tile_table
+from ifo_grounding.world.tiles import TILE_SIZES, tile_index, tile_table
 
 BATCH = 4096
 
@@ -55,7 +55,7 @@ def record_demonstrations(
     >>> demos
     Demonstrations(20 episodes, ... frames, FrameCodec(3x48x48, ... tiles of 8))
     """
-    tiles = tile_table(tile_size)
+    check_choice("tile size", tile_size, TILE_SIZES)
     n = at_least_one("the number of demonstrations", n)
     options = SceneOptions(task=task, **scenes)
     parts: list[Tensor] = []
@@ -78,7 +78,7 @@ def record_demonstrations(
         bar.close()
         torch.set_num_threads(threads)
     numbering = generator(seed, "demonstrations", "tile numbers")
-    codec, codes = FrameCodec.from_tiles(tiles, parts, numbering)
+    codec, codes = FrameCodec.from_tiles(tile_table(tile_size), parts, numbering)
     tokens = torch.cat(instructions)
     demos = Demonstrations(codec, codes, torch.cat(lengths), tokens, vocabulary=VOCABULARY)
     return (demos, Truth(torch.cat(actions))) if keep_truth else demos

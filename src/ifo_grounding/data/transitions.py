@@ -36,6 +36,9 @@ class RandomActions(TensorDictModuleBase):
 
     Those other than the stop are equally likely.
 
+    Raises:
+        UserError: where the actions are not categorical, or the stop is not one of them.
+
     >>> from ifo_grounding.envs import PickAndPlaceEnv
     >>> env = PickAndPlaceEnv("move", num_envs=3, seed=0)
     >>> RandomActions(env)(env.reset())["action"].shape

@@ -66,7 +66,7 @@ class NumberedEnv(EnvBase):
             return mask, None
         if numbers.is_floating_point() or numbers.dtype == torch.bool:
             raise UserError(f"scenes are asked for by integers, got {numbers.dtype}")
-        numbers = numbers.reshape(self.num_envs).long()
+        numbers = numbers.reshape(self.num_envs).to(mask.device).long()
         if bool(((numbers < 0) & mask).any()):
             raise UserError("scene numbers start at 0")
         return mask, numbers

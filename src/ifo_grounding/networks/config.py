@@ -61,8 +61,8 @@ class NetworkConfig:
     context: int = 0
     """Layers that let a cell see its neighbours (``strong``): residual blocks of the inverse model;
     in policy, critic and reward model convolutions over forms and word maps, with which places are
-    also read relative to what is seen. The classifiers always see one cell around. What begins with
-    a policy's weights has the policy's."""
+    also read relative to what is seen. The classifiers always see one cell around,
+    whatever this is. What begins with a policy's weights has the policy's."""
     heads: int = 8
     """Attention maps that read no words (``strong``)."""
     values: int = 16
@@ -130,6 +130,7 @@ class NetworksConfig:
     """States of the GRU that make an encoded sentence: ``mean`` or ``last`` (``paper``)."""
 
     def __post_init__(self) -> None:
+        check_range(self, "features", least=1, most=4096)  # a run's networks are all as wide
         NetworkConfig.of("policy", "paper", **self.changed())  # which has them all
 
     def changed(self) -> dict[str, Any]:

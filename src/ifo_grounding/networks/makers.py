@@ -195,7 +195,15 @@ def make_value(
     """
     options = {"in_keys": in_keys, "out_key": out_key}
     return build(
-        "value", spec_source, preset, options, device, seed, overrides, init_from, ValueOperator
+        "value",
+        spec_source,
+        preset,
+        options,
+        device,
+        seed,
+        overrides,
+        init_from,
+        wrap=ValueOperator,
     )
 
 

@@ -137,9 +137,9 @@ class Run:
             file = path.stat()
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except OSError as error:  # a name that is too long
+        except (OSError, ValueError) as error:  # a name that is too long, or no name
             raise UserError(
-                f"run={self.name!s:.40}... names no folder ({error.strerror})"
+                f"run={self.name!r:.40} names no folder ({first_line(error)})"
             ) from None
         try:
             options = _read_options(path.resolve(), file.st_ino, file.st_mtime_ns, file.st_size)

@@ -187,9 +187,8 @@ class BestCheckpoint(BestWeights):
     ) -> None:
         if by_accuracy and held_out is None:
             raise UserError(
-                "adversarial updates change the reward model, whose returns cannot then be "
-                "compared from one iteration to the next, so that accuracy selects the best "
-                "policy: give held_out=, or set select_every=0 to keep the last"
+                "the best policy is selected by its accuracy on held-out demonstrations, since "
+                "adversarial updates change what returns mean: give held_out=, or select_every=0"
             )
         super().__init__(policy)
         self.env, self.seed = env, seed
