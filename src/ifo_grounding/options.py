@@ -92,7 +92,7 @@ def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
             given = [[quoted(word, texts, comma="text") for word in job] for job in jobs]
             composed = [compose(script.stem, job) for job in given]
             for each in composed:
-                _refuse_unknown(plain(known), each)
+                _refuse_unknown(known, each)
             return [OmegaConf.to_object(each) for each in composed]
         return [_settled(job) for job in jobs]
 
@@ -163,7 +163,8 @@ def _settled(overrides: Sequence[str]) -> Options:
     known = few if isinstance(n, int) and n < FEW else [] if counted else ["budget=demo"]
     words += [f"~hydra/{group}" for group in UNREAD if "hydra" not in " ".join(named)]
     cfg = compose(CONFIG, words + known * free)
-    _refuse_unknown(plain(Options()), cfg)
+    trees: Any = plain(Options()), OmegaConf.to_container(cfg)
+    _refuse_unknown(*(leaves({**tree, "world": {}}) for tree in trees))  # whose options are its own
     number = _demonstrations(cfg)
     if free and not known and number < FEW:
         cfg = compose(CONFIG, words + few)
@@ -227,13 +228,11 @@ def plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
 
 
-def _refuse_unknown(options: Any, cfg: DictConfig) -> None:
-    """Refuse what ``+name=`` added to the options, but for a world's, and ``~name`` removed."""
-    raw: Any = OmegaConf.to_container(cfg)  # not resolved
-    known, given = leaves(options), leaves(raw)
+def _refuse_unknown(known: Mapping[Any, Any], given: Mapping[Any, Any]) -> None:
+    """Refuse what ``+name=`` added to the options, and what ``~name`` removed."""
     for name in sorted(known.keys() ^ given.keys()):
-        if name.partition(".")[0] != "world" or "world" not in options:
-            raise UserError(f"option {name} cannot be added or removed{did_you_mean(name, known)}")
+        hint = did_you_mean(name, known) if name in given else ""
+        raise UserError(f"option {name} cannot be added or removed{hint}")
 
 
 def explained(error: Exception) -> UserError:
