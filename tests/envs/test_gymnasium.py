@@ -126,7 +126,7 @@ def test_a_window_needs_no_screen(monkeypatch, driver):
 
 def test_a_missing_pygame_is_explained(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(UserError, match=r"ifo-grounding\[human\]"):
+    with pytest.raises(gymnasium.error.DependencyNotInstalled, match=r"ifo-grounding\[human\]"):
         PickAndPlaceGymEnv("move", render_mode="human")
 
 

@@ -6,8 +6,7 @@ import os
 from typing import Any
 
 import numpy as np
-
-from ifo_grounding.errors import optional
+from gymnasium.error import DependencyNotInstalled
 
 LINE_HEIGHT = 32
 LINE_COLOUR = (235, 235, 235)
@@ -21,12 +20,18 @@ class Window:
         fps: pictures per second that :meth:`show` waits for.
 
     Raises:
-        UserError: where pygame is missing.
+        DependencyNotInstalled: where pygame is missing.
     """
 
     def __init__(self, fps: float) -> None:
+        try:
+            import pygame
+        except ImportError as error:
+            raise DependencyNotInstalled(
+                "render_mode 'human' needs pygame: pip install 'ifo-grounding[human]'"
+            ) from error
         self.fps = fps
-        self._pygame = optional("pygame", extra="human")
+        self._pygame: Any = pygame
         self._surface: Any = None
 
     def show(self, frame: np.ndarray, text: str) -> None:

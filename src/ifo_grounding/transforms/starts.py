@@ -85,10 +85,12 @@ class StartingPairs(InstructionTransform):
     def _take(self, count: int) -> Tensor:
         """Take the next pairs, int64 [count]: each epoch has all of them in an order of its own."""
         pairs, first = len(self.scenes), self.used
-        self.used += count
-        epochs = range(first // pairs, self.used // pairs + 1)
-        orders = [_order(pairs, self.seed, epoch) for epoch in epochs]
-        return torch.cat(orders)[first % pairs :][:count]
+        self.used = end = first + count
+        taken = [
+            _order(pairs, self.seed, epoch)[max(first - epoch * pairs, 0) : end - epoch * pairs]
+            for epoch in range(first // pairs, end // pairs + 1)
+        ]
+        return torch.cat(taken)
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase:
         parent = self.parent
