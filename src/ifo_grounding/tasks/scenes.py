@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -32,8 +31,6 @@ PATIENCE = 1000
 """Draws for each scene after which a layout counts as unable to hold a suitable goal."""
 FEWEST = 1024
 """Scenes that are drawn at once at least: fewer take as long."""
-BLOCKS_KEPT = 64
-"""Blocks of so many scenes that are remembered."""
 
 
 class Scene(TensorClass):
@@ -224,18 +221,7 @@ class SceneStream:
     ) -> None:
         self.options, self.seed, self.device = options, seed, torch.device(device or "cpu")
 
+    @torch.inference_mode(False)
     def scenes(self, numbers: Tensor) -> Scene:
         """Return the scenes with the given numbers, int64 [N] from 0 on."""
-        blocks, which = (numbers // FEWEST).unique(return_inverse=True)
-        parts: list[Any] = [
-            _block(self.options, self.seed, block, self.device) for block in blocks.tolist() or [0]
-        ]
-        every: Any = parts[0] if len(parts) == 1 else torch.cat(parts)
-        return every[which * FEWEST + numbers % FEWEST]
-
-
-@functools.lru_cache(maxsize=BLOCKS_KEPT)
-@torch.inference_mode(False)
-def _block(options: SceneOptions, seed: int, block: int, device: torch.device) -> Scene:
-    numbers = torch.arange(block * FEWEST, (block + 1) * FEWEST, device=device)
-    return draw_scenes(options, seed, numbers)
+        return draw_scenes(self.options, self.seed, numbers.to(self.device))
