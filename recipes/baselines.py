@@ -14,6 +14,7 @@ from _shared import (
     TRANSITIONS,
     TRUTH,
     build,
+    coded_simulator,
     finish,
     load_demonstrations,
     load_labels,
@@ -21,6 +22,7 @@ from _shared import (
     open_run,
     open_stage,
     plain,
+    read_fast,
     save_network,
     simulator_of,
     tell,
@@ -53,7 +55,7 @@ from ifo_grounding.config import STAGES, Options
 from ifo_grounding.data import Collected, Truth, label_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import success_rate
-from ifo_grounding.networks import make_value
+from ifo_grounding.networks import make_value, read_codes
 from ifo_grounding.objectives import InverseLoss
 from ifo_grounding.report.results import by_scene
 from ifo_grounding.training import Run, Stage, fit, improve_policy
@@ -229,6 +231,9 @@ def adversarial(options: Options, stage: Stage) -> None:
         device=options.device,
         **more,
     )
+    read_fast(adversary.demonstrations, options)
+    if (tiles := world.tiles) is not None:
+        read_codes(adversary.network, tiles)
     practice = options.self_examine
     worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
     config = replace(
@@ -242,8 +247,7 @@ def adversarial(options: Options, stage: Stage) -> None:
     if method == "agile":
         env = seen.starts(options.seed)
     else:
-        starts = chosen_starts(run, options, simulator_of)  # demonstrations are read as pixels
-        env = TransformedEnv(simulator_of(options, worlds), starts)
+        env = TransformedEnv(coded_simulator(options, worlds), chosen_starts(run, options))
     history = improve_policy(
         env.append_transform(adversary.reward),
         policy,

@@ -110,9 +110,7 @@ def learned_reward(run: Run, options: Options) -> LearnedReward | GoalReward:
     return GoalReward(classifier, stop_action=world_of(options).stop_action)
 
 
-def chosen_starts(
-    run: Run, options: Options, simulator: Callable[..., Any] = coded_simulator
-) -> InstructionSampler | StartingPairs:
+def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPairs:
     """Return fresh states with chosen instructions, or the paper's fixed number of pairs."""
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
     pool, section = load_demonstrations(run).pool(), options.self_examine
@@ -120,7 +118,7 @@ def chosen_starts(
         return InstructionSampler(classifier, pool, **chosen_by(options))
     with torch.no_grad():
         pairs = select_pairs(
-            simulator(options, section.num_envs),
+            coded_simulator(options, section.num_envs),
             classifier,
             pool,
             section.pairs,

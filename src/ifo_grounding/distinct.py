@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -32,6 +34,24 @@ def distinct_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
     if torch.equal(found.index_select(0, index), rows):
         return found, index
     return torch.unique(rows, dim=0, return_inverse=True)
+
+
+def first_of_each(tables: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return a place of each distinct entry [N, ...] of tables side by side, and which it is.
+
+    Returns:
+        Places, int64 [U], and for each entry which of them holds the same, int64 [N].
+
+    >>> places, which = first_of_each([torch.tensor([[1.0], [3.0], [1.0]])])
+    >>> (places[which] % 2).tolist()
+    [0, 1, 0]
+    """
+    entries = [table.flatten(1).contiguous().view(torch.uint8) for table in tables]
+    side_by_side = torch.cat(entries, 1)
+    whole = F.pad(side_by_side, (0, -side_by_side.shape[1] % 8)).view(torch.int64)
+    found, which = distinct_rows(whole)
+    numbers = torch.arange(len(which), device=which.device)
+    return numbers.new_zeros(len(found)).scatter_(0, which, numbers), which
 
 
 def _hash(rows: Tensor) -> Tensor:

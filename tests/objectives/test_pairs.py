@@ -85,3 +85,17 @@ def test_random_actions_are_uniform_among_the_others():
     counts = torch.bincount(seen[0].flatten().long(), minlength=6)
     assert counts[4] == 0
     assert chi_squared(counts[counts > 0]) < 23.6  # 4 degrees of freedom, p = 1e-4
+
+
+def test_scenes_that_repeat_are_scored_as_any_others(preset):
+    network = make_loss("instruction", preset).eval().network
+    data = batch()[torch.arange(12) % 3]
+    others = POOL[torch.arange(24) % 4].view(12, 2, -1)
+    own, other = pairs.pair_scores(network, data, others, "suitability")
+    for row in range(12):
+        said = torch.cat([data["instruction"][row : row + 1], others[row]])
+        alone = data[row].expand(3).clone().set("instruction", said)
+        expected = network(alone)["suitability"].flatten()
+        torch.testing.assert_close(
+            torch.cat([own[row : row + 1], other[row]]), expected, rtol=1e-4, atol=1e-4
+        )

@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ifo_grounding.distinct import distinct_rows
 from ifo_grounding.networks.appearance import EVIDENCE, Appearance, ColourAndForm
 from ifo_grounding.networks.cells import cell_places, look_up
 from ifo_grounding.networks.config import NetworkConfig
@@ -88,7 +89,11 @@ class WordMaps(nn.Module):
             counts[tokens] = True  # of the others no evidence is needed
             used = counts.nonzero().squeeze(1)
         colour, form = self.evidence(seen, used)
-        spoken, modifier = self.listen(tokens, used)
+        if self.training or tokens.is_cuda:
+            spoken, modifier = self.listen(tokens, used)
+        else:
+            distinct, which = distinct_rows(tokens)
+            spoken, modifier = (look_up(each, which) for each in self.listen(distinct, used))
         if self.training:
             said = torch.zeros(len(self.usual), dtype=torch.bool, device=tokens.device)
             said[tokens] = True

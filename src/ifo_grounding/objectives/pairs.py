@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.distinct import distinct_rows, first_of_each
 from ifo_grounding.errors import UserError, share
 from ifo_grounding.modules import halves_of
 from ifo_grounding.objectives.mixture import MixtureEstimate
@@ -175,20 +175,33 @@ def pair_scores(
 ) -> tuple[Tensor, Tensor]:
     """Score each row's own instruction and others, token ids [N, K, L]: logits [N] and [N, K].
 
-    Each row's images and each distinct instruction are encoded once. On a GPU, where finding the
-    distinct ones would wait for it, all are encoded unless scenes are shared.
+    Each row's images and each distinct instruction are encoded once, and each distinct pair is
+    scored once where scenes repeat. On a GPU, where finding the distinct ones would wait for it,
+    all are encoded unless scenes are shared.
     """
     *pixel_keys, instruction_key = network.in_keys
+    images = [batch.get(key) for key in pixel_keys]
     both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
-    halves, count = halves_of(network, output), both.shape[1]
-    scenes = halves.encode_scenes(*(batch.get(key) for key in pixel_keys))
-    tokens = both.flatten(0, 1).long()
-    if tokens.is_cuda and isinstance(scenes, Tensor | TensorDictBase):
+    halves, tokens, shape = halves_of(network, output), both.flatten(0, 1).long(), both.shape[:2]
+    if tokens.is_cuda:
+        scenes = halves.encode_scenes(*images)
         which = torch.arange(len(tokens), device=tokens.device)
+        if not isinstance(scenes, Tensor | TensorDictBase):
+            tokens, which = distinct_rows(tokens)
+        words = halves.encode_instruction(tokens)
+        scores = halves.score_candidates(scenes, words, which.view(shape)).reshape(shape)
+        return scores[:, 0], scores[:, 1:]
+    tokens, which = distinct_rows(tokens)
+    words, which = halves.encode_instruction(tokens), which.view(shape)
+    first, scene = first_of_each(images)
+    if len(first) * len(words) < which.numel():
+        every = torch.arange(len(words)).expand(len(first), -1)
+        scenes = halves.encode_scenes(*(image[first] for image in images))
+        table = halves.score_candidates(scenes, words, every).flatten()
+        scores = table[scene.unsqueeze(1) * len(words) + which]
     else:
-        tokens, which = distinct_rows(tokens)
-    words = halves.encode_instruction(tokens)
-    scores = halves.score_candidates(scenes, words, which.view(-1, count)).reshape(-1, count)
+        scores = halves.score_candidates(halves.encode_scenes(*images), words, which)
+    scores = scores.reshape(shape)
     return scores[:, 0], scores[:, 1:]
 
 
