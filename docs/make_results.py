@@ -102,21 +102,20 @@ def babyai_rows() -> list[Row]:
     return rows
 
 
-ACCESS = {
-    "bc": ("yes", "no"),
-    "lc-rl": ("yes", "yes"),
-    "gail": ("yes", "no"),
-    "gail+bc": ("yes", "no"),
-    "agile": ("no", "yes"),
-    "agile-chosen": ("no", "no"),
-    "gaifo": ("no", "no"),
-    "bco": ("no", "no"),
-    "bco-alpha": ("no", "no"),
-    "ours": ("no", "no"),
-    "random": ("", ""),
-    "expert": ("", ""),
+USES = {
+    "bc": "true actions",
+    "lc-rl": "true actions, steps",
+    "gail": "true actions",
+    "gail+bc": "true actions",
+    "agile": "steps",
+    "agile-chosen": "",
+    "gaifo": "",
+    "bco": "",
+    "bco-alpha": "",
+    "ours": "",
+    "random": "",
 }
-"""Methods of Table 1: whether they may read true actions and step from demonstrations' states."""
+"""Methods of Table 1, and what they use beside frames and instructions."""
 PEERS = ("ours", "imitation", "imitation, own reward")
 """What learns GAIL in `benchmarks/gail.py`."""
 
@@ -125,14 +124,14 @@ def by_method() -> dict[tuple[str, int], dict[str, Runs]]:
     """Return the runs of each method of Table 1 by task and number of demonstrations."""
     found = read("baselines", lambda o: (o["task"], o["demonstrations"]["n"], o["method"]))
     sets = sorted({key[:2] for key in found}, key=lambda key: (TASKS.index(key[0]), -key[1]))
-    return {key: {m: found[(*key, m)] for m in ACCESS if (*key, m) in found} for key in sets}
+    return {key: {m: found[(*key, m)] for m in USES if (*key, m) in found} for key in sets}
 
 
 def baseline_rows(cell: Callable[[dict[str, Runs], str], str]) -> list[Row]:
     """Return a row for each method of Table 1, with a cell for each set of demonstrations."""
     sets, rows = by_method(), []
-    for method, (actions, steps) in ACCESS.items():
-        row = {"method": f"`{method}`", "true actions": actions, "steps from demonstrations": steps}
+    for method, used in USES.items():
+        row = {"method": f"`{method}`", "uses also": used}
         cells = {f"{t} {n:,}": cell(found, method) for (t, n), found in sets.items()}
         if any(cells.values()):
             rows.append(row | cells)
@@ -147,7 +146,7 @@ def reached(found: dict[str, Runs], method: str) -> str:
 def ours_ahead(found: dict[str, Runs], method: str) -> str:
     """Return how far ours is ahead of a method; p is corrected for the number of rivals."""
     ours = found.get("ours", [])
-    both = {m: with_ours(found[m], ours) for m in found if ACCESS[m][0] and m != "ours"}
+    both = {m: with_ours(found[m], ours) for m in found if m not in ("ours", "random")}
     behind = {m: difference(runs, m, "ours") for m, runs in both.items() if runs}
     if method not in behind:
         return ""

@@ -43,6 +43,8 @@ from ifo_grounding.transforms.reward import RewardTransform
 class DiscriminatorLoss(SupervisedLoss):
     """Binary cross entropy of demonstrations (1) against the policy (0).
 
+    TorchRL's ``GAILLoss`` reads one tensor of observations, not an image and a sentence.
+
     Writes ``loss_discriminator``, ``demonstrated_probability``, ``policy_probability`` and, with
     ``swapped``, ``swapped_probability``.
 
