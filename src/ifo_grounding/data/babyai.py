@@ -111,7 +111,8 @@ class _Room(gymnasium.Wrapper):
         tiles[here] = draw(grid.grid[here], agent_dir=self.level.agent_dir)
         if self.level.carrying is not None:
             tiles[0] = draw(self.level.carrying)
-        cells = np.concatenate(tiles).astype(np.uint8).reshape(grid.height, grid.width, size, size, 3)
+        pixels = np.concatenate(tiles).astype(np.uint8)
+        cells = pixels.reshape(grid.height, grid.width, size, size, 3)
         image = cells.swapaxes(1, 2).reshape(grid.height * size, grid.width * size, 3)
         return {"image": image, "mission": self.level.mission}
 
