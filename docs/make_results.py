@@ -103,11 +103,11 @@ def babyai_rows() -> list[Row]:
 
 
 USES = {
-    "bc": "true actions",
-    "lc-rl": "true actions, steps",
-    "gail": "true actions",
-    "gail+bc": "true actions",
-    "agile": "steps",
+    "bc": ": true actions",
+    "lc-rl": ": true actions, steps",
+    "gail": ": true actions",
+    "gail+bc": ": true actions",
+    "agile": ": steps",
     "agile-chosen": "",
     "gaifo": "",
     "bco": "",
@@ -131,10 +131,9 @@ def baseline_rows(cell: Callable[[dict[str, Runs], str], str]) -> list[Row]:
     """Return a row for each method of Table 1, with a cell for each set of demonstrations."""
     sets, rows = by_method(), []
     for method, used in USES.items():
-        row = {"method": f"`{method}`", "uses also": used}
         cells = {f"{t} {n:,}": cell(found, method) for (t, n), found in sets.items()}
         if any(cells.values()):
-            rows.append(row | cells)
+            rows.append({"method": f"`{method}`" + used, **cells})
     return rows
 
 
