@@ -106,10 +106,10 @@ USES = {
     "bc": ": true actions",
     "lc-rl": ": true actions, steps",
     "gail": ": true actions",
-    "gail+bc": ": true actions",
     "agile": ": steps",
-    "agile-chosen": "",
     "gaifo": "",
+    "gail+bc": ": true actions",
+    "agile-chosen": "",
     "bco": "",
     "bco-alpha": "",
     "ours": "",
@@ -183,7 +183,10 @@ def baseline_curves() -> bytes:
         for method, runs in found.items():
             curve = runs[0]["results"].get("curve", ())
             rows += [{"step": frames, f"{title} {method}": rate} for frames, rate in curve]
-    return figure_png(training_curves(sorted(rows, key=lambda row: row["step"]), panels))
+    figure = training_curves(sorted(rows, key=lambda row: row["step"]), panels)
+    for axes in figure.axes:
+        axes.set_ylim(-0.05, 1.05)
+    return figure_png(figure)
 
 
 def minutes(runs: Runs) -> int:
