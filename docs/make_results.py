@@ -103,12 +103,12 @@ def babyai_rows() -> list[Row]:
 
 
 USES = {
-    "bc": ": true actions",
-    "lc-rl": ": true actions, steps",
-    "gail": ": true actions",
-    "agile": ": steps",
+    "bc": "true actions",
+    "lc-rl": "true actions, steps",
+    "gail": "true actions",
+    "agile": "steps",
     "gaifo": "",
-    "gail+bc": ": true actions",
+    "gail+bc": "true actions",
     "agile-chosen": "",
     "bco": "",
     "bco-alpha": "",
@@ -120,6 +120,7 @@ PEERS = ("ours", "imitation", "imitation, own reward")
 """What learns GAIL in `benchmarks/gail.py`."""
 
 
+@cache
 def by_method() -> dict[tuple[str, int], dict[str, Runs]]:
     """Return the runs of each method of Table 1 by task and number of demonstrations."""
     found = read("baselines", lambda o: (o["task"], o["demonstrations"]["n"], o["method"]))
@@ -127,30 +128,32 @@ def by_method() -> dict[tuple[str, int], dict[str, Runs]]:
     return {key: {m: found[(*key, m)] for m in USES if (*key, m) in found} for key in sets}
 
 
-def baseline_rows(cell: Callable[[dict[str, Runs], str], str]) -> list[Row]:
+def baseline_rows(cells_of: Callable[[dict[str, Runs]], dict[str, str]]) -> list[Row]:
     """Return a row for each method of Table 1, with a cell for each set of demonstrations."""
-    sets, rows = by_method(), []
-    for method, used in USES.items():
-        cells = {f"{t} {n:,}": cell(found, method) for (t, n), found in sets.items()}
-        if any(cells.values()):
-            rows.append({"method": f"`{method}`" + used, **cells})
-    return rows
+    cells = {f"{task} {n:,}": cells_of(found) for (task, n), found in by_method().items()}
+    return [
+        {"method": f"`{method}`" + (f": {used}" if used else "")}
+        | {title: column.get(method, "") for title, column in cells.items()}
+        for method, used in USES.items()
+        if any(method in column for column in cells.values())
+    ]
 
 
-def reached(found: dict[str, Runs], method: str) -> str:
-    """Return the success of a method."""
-    return brief(rate(found[method], method)) if method in found else ""
+def reached(found: dict[str, Runs]) -> dict[str, str]:
+    """Return the success of each method."""
+    return {method: brief(rate(runs, method)) for method, runs in found.items()}
 
 
-def ours_ahead(found: dict[str, Runs], method: str) -> str:
-    """Return how far ours is ahead of a method; p is corrected for the number of rivals."""
-    ours = found.get("ours", [])
-    both = {m: with_ours(found[m], ours) for m in found if m not in ("ours", "random")}
+def ours_ahead(found: dict[str, Runs]) -> dict[str, str]:
+    """Return how far ours is ahead of each rival; p is corrected for their number."""
+    rivals = {m: runs for m, runs in found.items() if m not in ("ours", "random")}
+    both = {m: with_ours(runs, found.get("ours", [])) for m, runs in rivals.items()}
     behind = {m: difference(runs, m, "ours") for m, runs in both.items() if runs}
-    if method not in behind:
-        return ""
-    p = dict(zip(behind, holm([each.p_value for each in behind.values()]), strict=True))[method]
-    return brief(behind[method]) + (f", p = {shown_p(p)}" if p >= 1e-4 else "")
+    p = dict(zip(behind, holm([each.p_value for each in behind.values()]), strict=True))
+    return {
+        m: brief(each) + (f", p = {shown_p(p[m])}" if p[m] >= 1e-4 else "")
+        for m, each in behind.items()
+    }
 
 
 def with_ours(runs: Runs, ours: Runs) -> Runs:

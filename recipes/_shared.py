@@ -164,7 +164,12 @@ def build(make: Any, options: Options, **kwargs: Any) -> Any:
     world = world_of(options)
     if network.network_config.shapes.fit(world.vocabulary):
         network.vocabulary = world.vocabulary
-    if (tiles := world.tiles) is not None:
+    return reading_codes(network, options)
+
+
+def reading_codes(network: Any, options: Options) -> Any:
+    """Let a network read codes of the simulator's, where it has them, and return it."""
+    if (tiles := world_of(options).tiles) is not None:
         networks.read_codes(network, tiles)
     return network
 
@@ -242,9 +247,7 @@ def load_network(run: Run, name: str, recipe: str, options: Options) -> TensorDi
     """Load a network that an earlier recipe trained; another run's is refused."""
     path, checksum = run.need(name, recipe), checksums(run).get(name)
     network = networks.load(path, device=options.device, checksum=checksum)
-    if (tiles := world_of(options).tiles) is not None:
-        networks.read_codes(network, tiles)
-    return network
+    return reading_codes(network, options)
 
 
 def starting_policy(run: Run, options: Options, warm_start: bool) -> Any:
@@ -266,11 +269,6 @@ def chosen_by(options: Options) -> dict[str, Any]:
     """Return how instructions are chosen."""
     section = options.instruction
     return {name: getattr(section, name) for name in ("threshold", "candidates", "choose")}
-
-
-def evaluation_scenes(options: Options) -> dict[str, Any]:
-    """Return which scenes to evaluate on."""
-    return {name: getattr(options.evaluate, name) for name in ("seed", "stream", "split")}
 
 
 def result_file(options: Options) -> Path:

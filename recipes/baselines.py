@@ -23,6 +23,7 @@ from _shared import (
     open_stage,
     plain,
     read_fast,
+    reading_codes,
     save_network,
     simulator_of,
     tell,
@@ -55,7 +56,7 @@ from ifo_grounding.config import STAGES, Options
 from ifo_grounding.data import Collected, Truth, label_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import success_rate
-from ifo_grounding.networks import make_value, read_codes
+from ifo_grounding.networks import make_value
 from ifo_grounding.objectives import InverseLoss
 from ifo_grounding.report.results import by_scene
 from ifo_grounding.training import Run, Stage, fit, improve_policy
@@ -232,8 +233,7 @@ def adversarial(options: Options, stage: Stage) -> None:
         **more,
     )
     read_fast(adversary.demonstrations, options)
-    if (tiles := world.tiles) is not None:
-        read_codes(adversary.network, tiles)
+    reading_codes(adversary.network, options)
     practice = options.self_examine
     worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
     config = replace(

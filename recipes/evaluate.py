@@ -11,7 +11,6 @@ from _shared import (
     POLICIES,
     REWARD,
     chosen_by,
-    evaluation_scenes,
     finish,
     load_demonstrations,
     load_network,
@@ -82,6 +81,11 @@ def measured_success(policies: dict[str, Any], options: Options) -> dict[str, Su
     env, shown = played(options, options.evaluate.episodes)
     mode = options.evaluate.mode
     return {name: success_rate(each, env, mode=mode, **shown) for name, each in policies.items()}
+
+
+def evaluation_scenes(options: Options) -> dict[str, Any]:
+    """Return which scenes to evaluate on."""
+    return {name: getattr(options.evaluate, name) for name in ("seed", "stream", "split")}
 
 
 def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[str, Any]]:

@@ -28,30 +28,36 @@ def distinct_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
     [[1, 2], [3, 4], [1, 2]]
     """
     values, index = torch.unique(_hash(rows), return_inverse=True)
-    numbers = torch.arange(len(rows), device=rows.device)
-    first = numbers.new_zeros(len(values)).scatter_(0, index, numbers)
-    found = rows.index_select(0, first)  # many times as fast as rows[first]
+    found = rows.index_select(0, places_of(index, len(values)))  # many times as fast as rows[...]
     if torch.equal(found.index_select(0, index), rows):
         return found, index
     return torch.unique(rows, dim=0, return_inverse=True)
 
 
-def first_of_each(tables: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def places_of(index: Tensor, count: int) -> Tensor:
+    """Return a place in ``index``, int64 [M], at which each number below ``count`` stands."""
+    places = torch.arange(len(index), device=index.device)
+    return places.new_zeros(count).scatter_(0, index, places)
+
+
+def words_of(entries: Tensor) -> Tensor:
+    """View the bytes of each entry [N, ...] as int64 words [N, W], the last one filled up by 0."""
+    flat = entries.flatten(1).contiguous().view(torch.uint8)
+    return F.pad(flat, (0, -flat.shape[1] % 8)).view(torch.int64)
+
+
+def distinct_entries(tables: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Return a place of each distinct entry [N, ...] of tables side by side, and which it is.
 
     Returns:
         Places, int64 [U], and for each entry which of them holds the same, int64 [N].
 
-    >>> places, which = first_of_each([torch.tensor([[1.0], [3.0], [1.0]])])
+    >>> places, which = distinct_entries([torch.tensor([[1.0], [3.0], [1.0]])])
     >>> (places[which] % 2).tolist()
     [0, 1, 0]
     """
-    entries = [table.flatten(1).contiguous().view(torch.uint8) for table in tables]
-    side_by_side = torch.cat(entries, 1)
-    whole = F.pad(side_by_side, (0, -side_by_side.shape[1] % 8)).view(torch.int64)
-    found, which = distinct_rows(whole)
-    numbers = torch.arange(len(which), device=which.device)
-    return numbers.new_zeros(len(found)).scatter_(0, which, numbers), which
+    found, which = distinct_rows(torch.cat([words_of(table) for table in tables], 1))
+    return places_of(which, len(found)), which
 
 
 def _hash(rows: Tensor) -> Tensor:

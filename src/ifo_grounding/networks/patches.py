@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ifo_grounding.distinct import distinct_rows
+from ifo_grounding.distinct import distinct_rows, places_of
 from ifo_grounding.errors import UserError
 from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
 from ifo_grounding.mosaic import as_words, assemble
@@ -209,8 +209,7 @@ def distinct_windows(image: Tensor) -> Windows | None:
         return None
     index = index.view(2, 2, *here.shape).permute(2, 3, 0, 4, 1)  # [N, h, 2, w, 2]
     index = index.reshape(-1, 2 * height, 2 * width)
-    place = torch.arange(index.numel(), device=image.device)
-    place = place.new_zeros(len(known)).scatter_(0, index.flatten(), place)
+    place = places_of(index.flatten(), len(known))
 
     row, across = place // (2 * width) % (2 * height), place % (2 * width)
     windows = F.pad(image, (3, 0, 3, 0)).unfold(2, 7, 4).unfold(3, 7, 4)

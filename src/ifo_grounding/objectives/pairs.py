@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from ifo_grounding.distinct import distinct_rows, first_of_each
+from ifo_grounding.distinct import distinct_entries, distinct_rows
 from ifo_grounding.errors import UserError, share
 from ifo_grounding.modules import halves_of
 from ifo_grounding.objectives.mixture import MixtureEstimate
@@ -193,7 +193,7 @@ def pair_scores(
         return scores[:, 0], scores[:, 1:]
     tokens, which = distinct_rows(tokens)
     words, which = halves.encode_instruction(tokens), which.view(shape)
-    first, scene = first_of_each(images)
+    first, scene = distinct_entries(images)
     if len(first) * len(words) < which.numel():
         every = torch.arange(len(words)).expand(len(first), -1)
         scenes = halves.encode_scenes(*(image[first] for image in images))

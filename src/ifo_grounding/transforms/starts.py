@@ -13,9 +13,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.attributes import untransformed
+from ifo_grounding.distinct import words_of
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import INSTRUCTION, SCENE
-from ifo_grounding.mosaic import PIXELS_PER_WORD, as_words
 from ifo_grounding.seeding import generator
 from ifo_grounding.transforms.base import InstructionTransform, rows_of
 
@@ -151,9 +151,7 @@ def frame_hash(pixels: Tensor) -> Tensor:
     >>> frame_hash(frames).unique().numel()
     2
     """
-    flat = pixels.flatten(1)
-    flat = flat.to(torch.uint8) if flat.is_floating_point() else flat.contiguous().view(torch.uint8)
-    words = as_words(torch.nn.functional.pad(flat, (0, -flat.shape[1] % PIXELS_PER_WORD)))
+    words = words_of(pixels.to(torch.uint8) if pixels.is_floating_point() else pixels)
     # Odd multipliers keep every bit; int64 arithmetic wraps around, the same on any device.
     place = torch.arange(words.shape[1], device=words.device) * 2 + 1
     return ((words ^ (words >> 29)) * (place * 0x2545F4914F6CDD1D)).sum(-1)
