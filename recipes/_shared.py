@@ -243,9 +243,11 @@ def save_network(run: Run, name: str, network: Any) -> None:
     write_json(run / CHECKSUMS, {**checksums(run), name: networks.save(network, run / name)})
 
 
-def load_network(run: Run, name: str, recipe: str, options: Options) -> TensorDictModuleBase:
+def load_network(
+    run: Run, name: str, recipe: str, options: Options, stage: str | None = None
+) -> TensorDictModuleBase:
     """Load a network that an earlier recipe trained; another run's is refused."""
-    path, checksum = run.need(name, recipe), checksums(run).get(name)
+    path, checksum = run.need(name, recipe, stage), checksums(run).get(name)
     network = networks.load(path, device=options.device, checksum=checksum)
     return reading_codes(network, options)
 

@@ -61,6 +61,8 @@ from ifo_grounding.objectives import InverseLoss
 from ifo_grounding.report.results import by_scene
 from ifo_grounding.training import Run, Stage, fit, improve_policy
 
+ENTROPY = 0.01
+"""Weight of the entropy bonus of a policy that begins from nothing."""
 ROWS = 32
 """Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {
@@ -121,8 +123,13 @@ def trained(options: Options) -> Any:
         if stage.result is None:
             train = bco_alpha if method == "bco-alpha" else adversarial
             train(options, stage)
-    known = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
-    return load_network(run, known.get(method, file_of(method)), "baselines", options)
+    made = {
+        "bc": (REFERENCE, "imitate_truth"),
+        "bco": (POLICIES["phase1"], "imitate"),
+        "ours": (POLICIES["phase2"], "self_examine"),
+    }
+    file, by = made.get(method, (file_of(method), f"baseline_{method}"))
+    return load_network(run, file, "baselines", options, by)
 
 
 def imitate_truth(options: Options) -> dict:
@@ -163,7 +170,6 @@ def bco_alpha(options: Options, stage: Stage) -> None:
         demos.pool(),
         math.ceil(options.baseline.alpha * section.n),
         stop_action=world.stop_action,
-        drop_unchanged=section.drop_unchanged,
         seed=options.seed,
         progress=options.progress,
     )
@@ -194,7 +200,7 @@ def planned(options: Options) -> LCRL:
         found = planner.learn(options.baseline.likelihood_steps, ROWS, options.seed)
         save_network(run, file, planner.network)
         finish(options, stage, {"of": plain(options.baseline), **found})
-    trained = load_network(run, file, "baselines", options)
+    trained = load_network(run, file, "baselines", options, stage.name)
     planner.network.load_state_dict(trained.state_dict())
     return planner
 
@@ -214,7 +220,9 @@ def adversarial(options: Options, stage: Stage) -> None:
     """Train a policy against a discriminator; see :mod:`ifo_grounding.baselines`."""
     method, section = options.method, options.baseline
     run, world = stage.run, world_of(options)
-    begun = load_network(run, REFERENCE, "baselines", options) if method == "gail+bc" else None
+    begun = None
+    if method == "gail+bc":
+        begun = load_network(run, REFERENCE, "baselines", options, "imitate_truth")
     policy = new_policy(options, options.seed) if begun is None else begun
     value = build(make_value, options, init_from=policy)
     seen, more = access(options, run), options.networks.changed()
@@ -225,7 +233,6 @@ def adversarial(options: Options, stage: Stage) -> None:
         options.preset,
         steps=section.steps,
         lr=section.lr,
-        swapped=section.swapped,
         stop_action=world.stop_action,
         shapes=policy.network_config.shapes,
         seed=options.seed,
@@ -239,7 +246,7 @@ def adversarial(options: Options, stage: Stage) -> None:
     config = replace(
         practice,
         iterations=math.ceil(section.frames / rounds),
-        entropy=section.entropy,
+        entropy=ENTROPY,
         value_warmup=0 if begun is None else practice.value_warmup,
         select_every=0,
         evaluate_every=max(1, math.ceil(section.frames / rounds / 20)),

@@ -80,8 +80,8 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
                 if help_asked:
                     print(help_text(script, options))
                 elif isinstance(results := function(options), dict):
-                    seed = rf"(?<!\d){options.seed}(?!\d)"
-                    found.append((re.sub(seed, "*", options.run), results))
+                    seed = rf"(.*)(?<!\d){options.seed}(?!\d)"  # where it stands last
+                    found.append((re.sub(seed, r"\1*", options.run), results))
             if found[1:]:
                 from ifo_grounding.report.results import seeds_table
 

@@ -27,7 +27,7 @@ def distinct_rows(rows: Tensor) -> tuple[Tensor, Tensor]:
     >>> rows[index].tolist()
     [[1, 2], [3, 4], [1, 2]]
     """
-    values, index = torch.unique(_hash(rows), return_inverse=True)
+    values, index = torch.unique(hash_rows(rows), return_inverse=True)
     found = rows.index_select(0, places_of(index, len(values)))  # many times as fast as rows[...]
     if torch.equal(found.index_select(0, index), rows):
         return found, index
@@ -60,8 +60,8 @@ def distinct_entries(tables: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     return places_of(which, len(found)), which
 
 
-def _hash(rows: Tensor) -> Tensor:
-    """Hash rows [M, W] to 64 bits each: a sum weighed by odd numbers, modulo 2^64."""
+def hash_rows(rows: Tensor) -> Tensor:
+    """Hash rows, int64 [M, W], to int64 [M]: a sum weighed by odd numbers, modulo 2^64."""
     mixed = rows >> 29
     mixed ^= rows
     mixed *= torch.from_numpy(_factors(rows.shape[1])).to(rows.device)

@@ -19,10 +19,13 @@ from ifo_grounding.baselines import (
     DiscriminatorReward,
     GAIfO,
     SteppableDemonstrations,
+    steps_of_policy,
 )
 from ifo_grounding.data import record_demonstrations
+from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import STOP
+from ifo_grounding.networks import make_policy
 from ifo_grounding.training.reseeding import reseed
 from ifo_grounding.worlds import Grid, World
 
@@ -130,6 +133,20 @@ def test_the_likeliest_of_the_policys_are_spared():
     wrong = (softplus(-1) + softplus(0)) / 2
     expected = (softplus(-1) + wrong) / 2
     assert found["loss_discriminator"].item() == pytest.approx(expected, rel=1e-5)
+    with pytest.raises(UserError, match="spare"):
+        DiscriminatorLoss(scorer(), spare=1.0)  # none would be left
+
+
+def test_steps_of_a_policy_are_a_function_of_the_seed():
+    demos = record_demonstrations("move", 4, seed=0)
+    policy = make_policy(demos, seed=0)
+
+    def steps_after(seed):
+        torch.manual_seed(seed)
+        env = PickAndPlaceEnv("move", num_envs=4, seed=0, instructed=False)
+        return steps_of_policy(env, policy, demos.pool(), 40, seed=0).report.taken
+
+    assert torch.equal(steps_after(1), steps_after(2))
 
 
 def test_demonstrations_with_another_instruction_are_negatives():

@@ -3,6 +3,7 @@
 import importlib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -20,6 +21,7 @@ from ifo_grounding.playground import (
     taught_in,
     teaching,
 )
+from ifo_grounding.playground.drawing import picture
 from ifo_grounding.tasks import grammar
 from ifo_grounding.world import WorldState, kind
 from ifo_grounding.worlds import BabyAI, Grid, OpenGrid
@@ -55,6 +57,11 @@ def test_a_sentence_that_no_template_makes_is_followed_and_not_judged(agent):
         agent.play(7, 0, "fly to the moon")
     with pytest.raises(UserError, match="400 characters: 300"):
         agent.play(7, 0, 400 * "x")
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 6])
+def test_frames_of_any_world_are_drawn(channels):
+    assert picture(np.zeros((8, 8, channels), np.uint8)).startswith("data:image/png")
 
 
 def test_what_is_typed_is_completed_by_what_suits(agent):

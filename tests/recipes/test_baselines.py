@@ -54,6 +54,12 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
     stamp = trained.stat().st_mtime_ns if trained.exists() else None
     assert baseline(given) == results
     assert stamp is None or trained.stat().st_mtime_ns == stamp
+    policy = run / f"policy-{method}.safetensors"
+    if policy.exists():
+        policy.unlink()
+        with pytest.raises(UserError, match="run the recipe baselines"):
+            baseline(given)
+        assert not trained.exists()  # to run it again helps
 
 
 def test_a_rival_has_the_policy_of_the_run(options, tmp_path):

@@ -86,6 +86,9 @@ def test_frame_hash_tells_images_apart():
     swapped = images[:, :, :, [1, 0, 2, 3, 4]]
     differs = (swapped != images).flatten(1).any(1)
     assert (frame_hash(swapped) != frame_hash(images))[differs].all()
+    balanced = torch.zeros(2, 1, 8, 8, dtype=torch.uint8)  # 5 + 3 x 5 + 5 x 5 = 6 + 3 x 3 + 5 x 6
+    balanced[:, 0, :3, 0] = torch.tensor([[5, 5, 5], [6, 3, 6]])
+    assert frame_hash(balanced).unique().numel() == 2
 
 
 @pytest.mark.parametrize(

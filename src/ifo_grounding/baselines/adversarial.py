@@ -68,7 +68,7 @@ class DiscriminatorLoss(SupervisedLoss):
     ) -> None:
         super().__init__(network)
         self.output = network.out_keys[0]
-        self.spare, self.swapped = share("spare", spare), swapped
+        self.spare, self.swapped = share("spare", spare, full=False), swapped
 
     def forward(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
         """Compute the loss of a batch of demonstrated steps and one of the policy's."""

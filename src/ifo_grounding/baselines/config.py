@@ -35,10 +35,6 @@ class BaselineConfig:
     """Gradient steps of the discriminator after each iteration."""
     lr: float = 3e-4
     """Learning rate of the discriminator."""
-    swapped: bool = True
-    """Whether demonstrations with another instruction are negatives, too."""
-    entropy: float = 0.01
-    """Weight of the policy's entropy bonus."""
     alpha: float = 1.0
     """Of ``bco-alpha``: steps of the policy, by the number of random steps, from which the inverse
     model learns on."""
@@ -49,4 +45,3 @@ class BaselineConfig:
         check_numbers(self)
         check_range(self, "frames", "steps", "likelihood_steps", least=1)
         check_range(self, "lr", "alpha", above=0)
-        check_range(self, "entropy", least=0)

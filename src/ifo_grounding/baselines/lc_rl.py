@@ -28,9 +28,10 @@ from ifo_grounding.modules import evaluating
 from ifo_grounding.networks import make_instruction_classifier
 from ifo_grounding.training.loop import Metrics
 from ifo_grounding.training.updates import make_optimizer, means, update
+from ifo_grounding.world.dynamics import DOWN, LEFT, RIGHT, UP, neighbour
 
-UP, RIGHT, DOWN, LEFT = range(4)
-CHOICES = (UP, RIGHT, DOWN, LEFT, keys.STOP)
+MOVES = (UP, RIGHT, DOWN, LEFT)
+CHOICES = (*MOVES, keys.STOP)
 """What is planned with: the arm never picks."""
 
 
@@ -40,17 +41,7 @@ def neighbours(size: int) -> Tensor:
     >>> neighbours(2).tolist()
     [[0, 1, 2, 0], [1, 1, 3, 0], [0, 3, 2, 2], [1, 3, 3, 2]]
     """
-    cell = torch.arange(size * size)
-    row, column = cell // size, cell % size
-    return torch.stack(
-        [
-            torch.where(row > 0, cell - size, cell),
-            torch.where(column < size - 1, cell + 1, cell),
-            torch.where(row < size - 1, cell + size, cell),
-            torch.where(column > 0, cell - 1, cell),
-        ],
-        1,
-    )
+    return neighbour(torch.arange(size * size).unsqueeze(1), torch.tensor(MOVES), size)[0]
 
 
 def soft_values(reward: Tensor, moves: Tensor, horizon: int) -> Tensor:
@@ -170,12 +161,12 @@ class LCRL:
 
     def learn(self, steps: int, batch_size: int = 32, seed: int = 0) -> Metrics:
         """Raise the likelihood of demonstrated choices; return mean metrics."""
-        source = torch.Generator().manual_seed(seed)
+        torch.manual_seed(seed)
         demos, updates = self.seen.demos, []
         episode, _ = demos.locate()
         self.network.train()
         for _ in range(steps):
-            index = torch.randperm(len(demos), generator=source)[:batch_size].sort().values
+            index = torch.randperm(len(demos))[:batch_size].sort().values
             frames, instruction = walk(self.seen.steps.env, index, self.size)
             chosen = soft_values(self.rewards(frames, instruction), self.moves, self.horizon)
             of_these = torch.isin(episode, index)

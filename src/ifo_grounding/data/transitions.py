@@ -25,6 +25,7 @@ from ifo_grounding.data.decoding import FrameDecoder
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, at_least_one, share, whole
 from ifo_grounding.progress import progress_bar
+from ifo_grounding.seeding import derive
 from ifo_grounding.seeding import generator as seeded
 
 KIND = "ifo-grounding transitions"
@@ -183,6 +184,8 @@ def collect_transitions(
             "drop_unchanged=False"
         )
     chance = RandomActions(env, stop_probability, stop_action, seed)
+    if policy is not None:
+        torch.manual_seed(derive(seed, "policy"))
     taken = torch.zeros(chance.n_actions, dtype=torch.int64)
     actions: list[Tensor] = []
 

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from ifo_grounding.playground.agent import Played
+from ifo_grounding.report.drawing import coloured
 from ifo_grounding.report.tracing import sharpest
 from ifo_grounding.texts import one_line
 from ifo_grounding.world import render
@@ -74,8 +75,7 @@ def action_words(actions: Sequence[str]) -> list[str]:
 def picture(frame: np.ndarray) -> str:
     """Return a frame, uint8 [H, W, C], as the source of an image."""
     buffer = io.BytesIO()
-    shown = frame[..., 0] if frame.shape[-1] == 1 else frame
-    Image.fromarray(np.ascontiguousarray(shown)).save(buffer, format="PNG", compress_level=1)
+    Image.fromarray(coloured(frame.transpose(2, 0, 1))).save(buffer, format="PNG", compress_level=1)
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 

@@ -200,8 +200,8 @@ class Run:
     def _record_path(self, name: str) -> Path:
         return self / f"stages/{name}.json"
 
-    def need(self, name: str, recipe: str) -> Path:
-        """Return the path of what an earlier recipe made.
+    def need(self, name: str, recipe: str, stage: str | None = None) -> Path:
+        """Return the path of what an earlier recipe made, in a stage of its own name by default.
 
         Raises:
             UserError: where it is not there, with the recipe that makes it.
@@ -209,7 +209,7 @@ class Run:
         path = self / name
         if not path.exists():
             # Its stage may count as done: to run it again has to help.
-            self._record_path(recipe).unlink(missing_ok=True)
+            self._record_path(stage or recipe).unlink(missing_ok=True)
             raise UserError(f"{path} is missing: run the recipe {recipe} with the same run first")
         return path
 

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding.attributes import untransformed
-from ifo_grounding.distinct import words_of
+from ifo_grounding.distinct import hash_rows, words_of
 from ifo_grounding.errors import UserError
 from ifo_grounding.keys import INSTRUCTION, SCENE
 from ifo_grounding.seeding import generator
@@ -151,7 +151,4 @@ def frame_hash(pixels: Tensor) -> Tensor:
     >>> frame_hash(frames).unique().numel()
     2
     """
-    words = words_of(pixels.to(torch.uint8) if pixels.is_floating_point() else pixels)
-    # Odd multipliers keep every bit; int64 arithmetic wraps around, the same on any device.
-    place = torch.arange(words.shape[1], device=words.device) * 2 + 1
-    return ((words ^ (words >> 29)) * (place * 0x2545F4914F6CDD1D)).sum(-1)
+    return hash_rows(words_of(pixels.to(torch.uint8) if pixels.is_floating_point() else pixels))
