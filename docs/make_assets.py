@@ -18,7 +18,7 @@ from ifo_grounding.evaluation import record_episodes
 from ifo_grounding.report import Captioned, animation, gallery
 from ifo_grounding.report.animation import gif
 from ifo_grounding.report.theme import GOOD
-from ifo_grounding.tasks import TASKS, VOCABULARY, SceneOptions, SceneStream
+from ifo_grounding.tasks import TASKS, VOCABULARY, SceneOptions, draw_scenes
 from ifo_grounding.training import Run
 from ifo_grounding.world import render
 
@@ -28,8 +28,8 @@ SCENES, TRIED = 4, 60
 def world() -> bytes:
     cases = []
     for number, task in enumerate(TASKS):
-        stream = SceneStream(SceneOptions(task, stream="validation"), seed=0)
-        scene = stream.scenes(torch.tensor([3 * number]))
+        options = SceneOptions(task, stream="validation")
+        scene = draw_scenes(options, 0, torch.tensor([3 * number]))
         (sentence,) = VOCABULARY.decode(scene.instruction)
         picture = render(scene.state, tile_size=32)[0].numpy()
         cases.append(Captioned(picture, sentence, note=task, colour=GOOD))

@@ -17,7 +17,6 @@ def collect(options: Options) -> dict:
         section.n,
         stop_probability=None if stop is None else section.stop_probability,
         stop_action=stop,
-        drop_unchanged=section.drop_unchanged,
         seed=options.seed,
         progress=options.progress,
     )

@@ -15,13 +15,7 @@ def train_goal(options: Options) -> dict:
         return stage.result
     demos = load_demonstrations(stage.run)
     policy = starting_policy(stage.run, options, section.warm_start)
-    loss = GoalLoss(
-        build(make_goal_classifier, options, init_from=policy),
-        demos.pool(),
-        negatives=section.negatives,
-        removal_rate=section.removal_rate,
-        near=section.near,
-    )
+    loss = GoalLoss(build(make_goal_classifier, options, init_from=policy), demos.pool())
     return learn(options, stage, loss, goal_buffer(demos), section, GOAL)
 
 

@@ -5,14 +5,15 @@ import math
 import torch
 from _shared import (
     CLASSIFIER,
+    POLICIES,
     build,
     coded_simulator,
     fit_options,
     keep,
     load_demonstrations,
+    load_network,
     open_stage,
     read_fast,
-    starting_policy,
     tell,
 )
 from torch import Tensor
@@ -49,7 +50,7 @@ def losses(
 ) -> list[InstructionLoss]:
     """Return the loss of each trial: the last one begins without the policy's roles of words."""
     section, pool = options.instruction, demos.pool()
-    policy = starting_policy(run, options, section.warm_start)
+    policy = load_network(run, POLICIES["phase1"], "imitate", options)
     likely = [(True, trial_seed(options.seed, number)) for number in range(section.trials - 1)]
     return [
         InstructionLoss(

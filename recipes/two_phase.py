@@ -67,7 +67,7 @@ def expected_minutes(options: Options) -> float:
     fresh = 32 if options.demonstrations.n < told.fresh_states else 0
     scored = (told.steps + (told.trials - 1) * told.trial_steps) * told.batch_size
     seconds += scored * (1 + told.negatives + fresh) * 1e-5
-    seconds += goal.steps * goal.batch_size * (1 + goal.negatives) * 4e-5
+    seconds += goal.steps * goal.batch_size * 3.6e-4
     practised = options.self_examine
     seconds += practised.iterations * practised.num_envs * practised.steps * 3e-4
     searched = 10 * (practised.pairs or 0) * min(told.candidates, options.demonstrations.n)

@@ -8,7 +8,7 @@ from torchrl.envs import EnvBase
 from ifo_grounding import networks
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.seeding import Lots
-from ifo_grounding.tasks import SceneOptions, SceneStream
+from ifo_grounding.tasks import SceneOptions, draw_scenes
 from ifo_grounding.world import random_layout, render, step, tile_index, tile_table
 from ifo_grounding.world.dynamics import PICK_PLACE, neighbour
 
@@ -68,7 +68,7 @@ def test_partial_resets_beat_choosing_pixel_by_pixel():
 
 
 def test_distinct_cells_beat_all_cells():
-    scenes = SceneStream(SceneOptions("move"), seed=0).scenes(torch.arange(128))
+    scenes = draw_scenes(SceneOptions("move"), 0, torch.arange(128))
     pixels = render(scenes.state)
     shapes = networks.Shapes(image_shape=(3, 48, 48), vocabulary_size=48, tile_size=8)
     network = networks.make_policy(shapes, seed=0)[0].module

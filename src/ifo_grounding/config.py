@@ -62,8 +62,6 @@ class TransitionsConfig:
     """Worlds side by side."""
     stop_probability: float = 0.05
     """Probability of the stop in a random step."""
-    drop_unchanged: bool = True
-    """Leave out steps other than stops that change nothing: any action could have been theirs."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -128,8 +126,6 @@ class InstructionConfig(FitConfig):
     """Initial weights that are tried; the last trial begins without the policy's roles of words."""
     trial_steps: int = 300
     """Steps of each trial."""
-    warm_start: bool = True
-    """Begin with the weights of the phase-1 policy."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,19 +149,8 @@ class RewardConfig(FitConfig):
 class GoalConfig(FitConfig):
     """The goal classifier (an extension)."""
 
-    negatives: int = 8
-    """Other instructions that each last frame is scored with."""
-    near: float = 0.0
-    """Share of the negatives that differ from the demonstration's instruction in few words."""
-    removal_rate: float | None = 0.0
-    """Share of the negatives that is taken for fulfilled; null estimates it."""
     warm_start: bool = True
     """Begin with the weights of the phase-1 policy."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, "negatives", least=1)
-        check_range(self, "near", "removal_rate", least=0, most=0.999)
 
 
 @dataclass

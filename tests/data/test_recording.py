@@ -6,14 +6,14 @@ import torch
 from ifo_grounding.data import Demonstrations, Truth, record_demonstrations, recording
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import derive
-from ifo_grounding.tasks import TASKS, SceneOptions, SceneStream, achieved, grammar, verdict
+from ifo_grounding.tasks import TASKS, SceneOptions, draw_scenes, fulfilled, grammar, plan, verdict
 from ifo_grounding.world import Layout, render, step
 
 
 def scenes_of(task: str, n: int, seed: int = 0, **options):
     """The scenes that a recording begins with."""
-    stream = SceneStream(SceneOptions(task, **options), derive(seed, "demonstrations"))
-    return stream.scenes(torch.arange(n))
+    key = derive(seed, "demonstrations")
+    return draw_scenes(SceneOptions(task, **options), key, torch.arange(n))
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -34,7 +34,7 @@ def test_frames_show_the_actions_that_fulfil_the_instruction(task):
         assert torch.equal(pixels[-2], pixels[-1])
         assert (actions[number] == 5).tolist() == [False] * (len(actions[number]) - 1) + [True]
         one = slice(number, number + 1)
-        assert achieved(scenes.state[one], state, goals[one]).all()
+        assert fulfilled(state, plan(scenes.state[one], goals[one])).all()
 
 
 def test_batches_are_joined_in_order(monkeypatch):
@@ -48,7 +48,7 @@ def test_batches_are_joined_in_order(monkeypatch):
 
 
 def test_streams_and_environments_of_the_same_seed_differ():
-    shown = SceneStream(SceneOptions("move"), 0).scenes(torch.arange(50))
+    shown = draw_scenes(SceneOptions("move"), 0, torch.arange(50))
     recorded = [
         record_demonstrations("move", 50, stream=stream).first_frames()
         for stream in ("training", "validation", "evaluation")

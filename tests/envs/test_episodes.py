@@ -22,8 +22,8 @@ from ifo_grounding.tasks import (
     Goal,
     Plan,
     Scene,
-    SceneStream,
     Vocabulary,
+    draw_scenes,
     expert,
     grammar,
 )
@@ -64,7 +64,7 @@ def test_steps_and_rewards_agree_with_the_plain_rules(task):
 def test_success_counts_when_time_runs_out(late):
     env = PickAndPlaceEnv("pick", 64, seed=0)
     td = env.reset()
-    scene = env._simulator.stream.scenes(env.scene_numbers)
+    scene = draw_scenes(*env._simulator.seeded, env.scene_numbers)
     idles = scene.state.objects[torch.arange(64), scene.state.arm] == 0  # P does nothing there
     assert idles.sum() > 30
     begins = 40 - (scene.wanted.steps - 1) + late
@@ -104,7 +104,7 @@ def test_partial_resets_of_many_worlds_show_what_is_there(instructed, foreign):
             assert torch.equal(td["logits"] == 0, mask.unsqueeze(-1).expand(-1, 6))
             assert torch.equal(td["collector", "number"], torch.arange(1, 257) * ~mask)
         if instructed:
-            began = env._simulator.stream.scenes(env.scene_numbers)
+            began = draw_scenes(*env._simulator.seeded, env.scene_numbers)
             assert torch.equal(td["instruction"], began.instruction)
             assert torch.equal(env.truth.wanted.objects, began.wanted.objects)
         if turn % 2:  # twice, and a step, before anybody reads
@@ -174,7 +174,7 @@ def test_a_learner_s_environment_hides_what_is_true(make):
     """No public name leads to a state, a goal or the world; what is kept apart holds no goal."""
     env = make(num_envs=4, seed=0, instructed=False)
     env.rollout(3)
-    hidden = WorldState | Scene | Plan | Goal | SceneStream | gymnasium.Env | VectorEnv
+    hidden = WorldState | Scene | Plan | Goal | gymnasium.Env | VectorEnv
     assert not [one for one in reachable(env) if isinstance(one, hidden)]
     for spec in (env.output_spec, env.input_spec):
         parts = {part for key in spec.keys(True, True) for part in key}
@@ -186,7 +186,7 @@ def test_a_learner_s_environment_hides_what_is_true(make):
     with pytest.raises(UserError, match="keeps its true state to itself"):
         _ = env.truth
     for kept in (env, pickle.loads(pickled)):
-        scenes = [kept._simulator.scene, kept._simulator.stream.scenes(torch.arange(50))]
+        scenes = [kept._simulator.scene, draw_scenes(*kept._simulator.seeded, torch.arange(50))]
         assert not any(s.instruction.any() or s.wanted.objects.any() for s in scenes)
 
 

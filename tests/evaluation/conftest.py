@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from ifo_grounding.tasks import SceneOptions, SceneStream, expert
+from ifo_grounding.tasks import SceneOptions, draw_scenes, expert
 from ifo_grounding.world import WorldState
 
 
@@ -12,11 +12,11 @@ class Expert:
     """Follows shortest paths; needs an env with ``expose_state=True``."""
 
     def __init__(self, task: str, seed: int = 0, stream: str = "evaluation") -> None:
-        self.scenes = SceneStream(SceneOptions(task, stream=stream), seed)
+        self.seeded = SceneOptions(task, stream=stream), seed
 
     def __call__(self, td: TensorDictBase) -> TensorDictBase:
         state = WorldState(**dict(td["state"].items()), batch_size=td.batch_size)
-        wanted = self.scenes.scenes(td["scene"].squeeze(-1)).wanted
+        wanted = draw_scenes(*self.seeded, td["scene"].squeeze(-1)).wanted
         return td.set("action", expert.act(state, wanted))
 
     def on_even_scenes(self, td: TensorDictBase) -> TensorDictBase:
@@ -26,7 +26,7 @@ class Expert:
 
     def steps(self, episodes: int) -> torch.Tensor:
         """Lengths of the shortest solutions."""
-        return self.scenes.scenes(torch.arange(episodes)).wanted.steps
+        return draw_scenes(*self.seeded, torch.arange(episodes)).wanted.steps
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import compare_endings, episode_endings, success_rate
 from ifo_grounding.evaluation.endings import ENDINGS
-from ifo_grounding.tasks.grammar import grammar
+from ifo_grounding.tasks import draw_scenes, grammar
 
 U, R, D, L, P, S = range(6)
 EPISODES = 40
@@ -17,7 +17,7 @@ class Scripted:
     def __init__(self, task, rule):
         env = PickAndPlaceEnv(task, EPISODES, seed=0, stream="evaluation")
         env.reset()
-        scene = env._simulator.stream.scenes(env.scene_numbers)
+        scene = draw_scenes(*env._simulator.seeded, env.scene_numbers)
         goals = grammar(task).parse_tokens(scene.instruction)
         self.plans = [rule(scene[row], goals[row]) for row in range(EPISODES)]
         self.step = 0

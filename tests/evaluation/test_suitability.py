@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import suitable_rate
-from ifo_grounding.tasks import REASONS, SceneOptions, SceneStream, grammar, verdict
+from ifo_grounding.tasks import REASONS, SceneOptions, draw_scenes, grammar, verdict
 from ifo_grounding.world import render
 
 
@@ -24,8 +24,8 @@ def as_classifier(function):
 
 def oracle(task, states, flip=0.0):
     """A classifier that recognises the fresh states by their pictures and asks the truth."""
-    stream = SceneStream(SceneOptions(task, instructed=False, stream="evaluation"), 0)
-    state = stream.scenes(torch.arange(states)).state
+    options = SceneOptions(task, instructed=False, stream="evaluation")
+    state = draw_scenes(options, 0, torch.arange(states)).state
     numbers = {picture.numpy().tobytes(): row for row, picture in enumerate(render(state, 8))}
     lies = torch.Generator().manual_seed(1)
 
@@ -66,8 +66,8 @@ def test_the_oracle_is_perfect(task):
 def test_errors_are_counted_by_kind():
     pool = ["go to the cell above the red circle"]
     result = suitable_rate(YES, "move-udlr", pool, states=2000, pairs_per_state=0)
-    scenes = SceneStream(SceneOptions("move-udlr", instructed=False, stream="evaluation"), 0)
-    state = scenes.scenes(torch.arange(2000)).state
+    options = SceneOptions("move-udlr", instructed=False, stream="evaluation")
+    state = draw_scenes(options, 0, torch.arange(2000)).state
     goal = grammar("move-udlr").parse(pool)[torch.zeros(2000, dtype=torch.int64)]
     counts = verdict(state, goal).bincount(minlength=len(REASONS)).tolist()
     assert result.rate.successes == counts[0] > 0

@@ -229,7 +229,7 @@ def test_other_actions_than_the_networks_are_refused(kind, action):
 
 def test_goal_loss_by_hand():
     data = BOTH[[0, 0, 1]].set("final", torch.tensor([[True], [False], [False]]))
-    out = GoalLoss(suitability([0.9, 0.6], "goal_score"), TWO, removal_rate=0.0)(data)
+    out = GoalLoss(suitability([0.9, 0.6], "goal_score"), TWO)(data)
     finished, elsewhere = -math.log(0.9), -math.log(0.4)
     expected = (finished + (NEGATIVES + elsewhere) / 2) / 2
     assert out["loss_goal"].item() == pytest.approx(expected, rel=1e-5)
@@ -304,19 +304,15 @@ def test_training_goes_on_after_calibration_as_if_there_had_been_none(share):
 
 
 @pytest.mark.parametrize(
-    ("kind", "options", "random"),
-    [
-        ("instruction", {}, 2),
-        ("instruction", {"states": torch.zeros(3, 3, 24, 24, dtype=torch.uint8), "fresh": 2}, 4),
-        ("goal", {}, 2),  # of final frames alone
-    ],
+    ("options", "random"),
+    [({}, 2), ({"states": torch.zeros(3, 3, 24, 24, dtype=torch.uint8), "fresh": 2}, 4)],
 )
-def test_the_share_of_suitable_pairs_comes_from_random_ones_alone(kind, options, random):
-    loss, seen = make_loss(kind, negatives=3, near=0.5, removal_rate=None, **options), []
+def test_the_share_of_suitable_pairs_comes_from_random_ones_alone(options, random):
+    loss, seen = make_loss("instruction", negatives=3, near=0.5, removal_rate=None, **options), []
     loss.negatives.estimate.add = lambda own, other: seen.append((len(own), other.shape[-1]))
     loss.negatives.estimate.ratio = 100
     loss(batch())
-    assert seen == [(int(batch()["final"].sum()) if kind == "goal" else 12, random)]
+    assert seen == [(12, random)]
 
 
 def test_adversarial_training_leaves_out_padding():

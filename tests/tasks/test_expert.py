@@ -3,7 +3,7 @@ from collections import Counter
 import pytest
 import torch
 
-from ifo_grounding.tasks import TASKS, SceneOptions, SceneStream, grammar, plan
+from ifo_grounding.tasks import TASKS, SceneOptions, draw_scenes, grammar, plan
 from ifo_grounding.tasks.expert import act
 from ifo_grounding.world import Layout, WorldState, step
 from ifo_grounding.world.dynamics import STOP
@@ -21,7 +21,7 @@ from reference import holds, plain, shortest, wishes
 )
 def test_no_shorter_success_exists(task, layout, scenes, longest):
     """Breadth-first search over all that can be done, picking up others included."""
-    drawn = SceneStream(SceneOptions(task, layout=layout), seed=0).scenes(torch.arange(300))
+    drawn = draw_scenes(SceneOptions(task, layout=layout), 0, torch.arange(300))
     drawn = drawn[drawn.wanted.steps <= longest][:scenes]
     assert len(drawn) == scenes
     goals = wishes(grammar(task).parse_tokens(drawn.instruction))

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from ifo_grounding.tasks import REASONS, TASKS, Goal, achieved, plan, verdict
+from ifo_grounding.tasks import REASONS, TASKS, Goal, fulfilled, plan, verdict
 from ifo_grounding.tasks.goals import MAX_STEPS
 from reference import BOXES, KINDS, SIDES, Plain, worlds
 
@@ -75,7 +75,7 @@ def test_a_full_hand_makes_every_goal_unachievable():
     begin = scene({(2, 2): RED}, held=BLUE)
     assert reason(begin, goal(**MOVE)) == "unachievable"
     there = scene({(2, 2): RED}, arm=(2, 2), held=BLUE)
-    assert not bool(achieved(begin, there, goal(**MOVE)))
+    assert not bool(fulfilled(there, plan(begin, goal(**MOVE))))
 
 
 BEGIN = {(2, 2): RED, (1, 1): BLUE}
@@ -95,20 +95,20 @@ BEGIN = {(2, 2): RED, (1, 1): BLUE}
 )
 def test_success_of_pick_by_hand(arm, objects, held, expected):
     final = scene(objects, GREEN, arm, held)
-    assert bool(achieved(scene(BEGIN, GREEN), final, goal(**PICK))) is expected
+    assert bool(fulfilled(final, plan(scene(BEGIN, GREEN), goal(**PICK)))) is expected
 
 
 def test_referents_are_those_of_the_initial_state():
     """Moving the reference along does not help: it has to stay where it began."""
-    wish = goal(**BESIDE, side="right")
+    wanted = plan(scene(BEGIN), goal(**BESIDE, side="right"))
     right = scene({(1, 2): RED, (1, 1): BLUE})
     both = scene({(2, 2): RED, (2, 1): BLUE})
-    assert bool(achieved(scene(BEGIN), right, wish))
-    assert not bool(achieved(scene(BEGIN), both, wish))
+    assert bool(fulfilled(right, wanted))
+    assert not bool(fulfilled(both, wanted))
 
 
 def test_other_objects_of_the_same_kind_are_alike():
     """The world does not tell two red circles apart, so neither does success."""
-    begin = scene({(2, 2): RED, (1, 1): RED}, BOTH)
-    assert bool(achieved(begin, scene({(4, 4): RED, (1, 1): RED}, BOTH), goal(**OUT)))
-    assert not bool(achieved(begin, scene({(2, 2): RED, (4, 4): RED}, BOTH), goal(**OUT)))
+    wanted = plan(scene({(2, 2): RED, (1, 1): RED}, BOTH), goal(**OUT))
+    assert bool(fulfilled(scene({(4, 4): RED, (1, 1): RED}, BOTH), wanted))
+    assert not bool(fulfilled(scene({(2, 2): RED, (4, 4): RED}, BOTH), wanted))

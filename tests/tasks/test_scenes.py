@@ -13,7 +13,7 @@ from ifo_grounding.world import Layout, render
 
 
 def first(n: int, seed: int = 0, **options) -> tasks.Scene:
-    return tasks.SceneStream(tasks.SceneOptions(**options), seed).scenes(torch.arange(n))
+    return draw_scenes(tasks.SceneOptions(**options), seed, torch.arange(n))
 
 
 def same(one: tasks.Scene, other: tasks.Scene) -> bool:
@@ -35,13 +35,12 @@ def test_every_instruction_is_suitable(task):
 def test_a_number_names_one_scene_in_any_order():
     options, block = tasks.SceneOptions("pick-out"), FEWEST
     numbers = torch.tensor([3, 2 * block + 5, 0, block, 3, block - 1])
-    scenes = tasks.SceneStream(options, seed=0).scenes(numbers)
-    fresh = tasks.SceneStream(options, seed=0)
-    alone = torch.cat([fresh.scenes(number[None]) for number in numbers.flip(0)]).flip(0)
+    scenes = draw_scenes(options, 0, numbers)
+    alone = torch.cat([draw_scenes(options, 0, number[None]) for number in numbers.flip(0)]).flip(0)
     assert same(scenes, alone)
     assert same(scenes[0], scenes[4])
     assert not same(scenes[0], scenes[2])
-    assert len(fresh.scenes(numbers[:0])) == 0
+    assert len(draw_scenes(options, 0, numbers[:0])) == 0
     assert same(tasks.Scene.of(module.leaves(scenes)), scenes)
 
 

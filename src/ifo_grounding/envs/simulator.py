@@ -18,7 +18,6 @@ from ifo_grounding.tasks.scenes import (
     FEWEST,
     Scene,
     SceneOptions,
-    SceneStream,
     draw_scenes,
     leaves,
 )
@@ -84,7 +83,7 @@ class Simulator:
     @torch.inference_mode(False)
     def seed(self, seed: int) -> None:
         """Go to the first scene of the stream of this seed."""
-        self.stream = SceneStream(self.options, seed, self.device)
+        self.seeded = self.options, seed
         self._next = torch.zeros((), dtype=torch.int64, device=self.device)
         self._ahead: list[Tensor] = []
         self._drawn = self._most = 0
@@ -99,7 +98,6 @@ class Simulator:
         self._ahead = [leaf.to(device) for leaf in self._ahead]
         vars(self).pop("scene", None)
         self._canvas = Canvas(self.tile_size)
-        self.stream = SceneStream(self.stream.options, self.stream.seed, device)
         return self
 
     @property
@@ -131,7 +129,7 @@ class Simulator:
             self._next += order[-1]
             places = numbers % len(drawn[0])
         else:
-            drawn = leaves(self.stream.scenes(numbers.where(mask, 0)))
+            drawn = leaves(draw_scenes(*self.seeded, numbers.where(mask, 0)))
             places = torch.arange(self.num_envs, device=self.device)
         self.steps.masked_fill_(mask, 0)
         torch.where(mask, numbers, self.numbers, out=self.numbers)
@@ -162,7 +160,7 @@ class Simulator:
         if self._most + self.num_envs > self._drawn:
             end = self._most + (count if self._ahead else max(FEWEST, self.num_envs))
             for part in torch.arange(self._drawn, end, device=self.device).split(CHUNK):
-                drawn = leaves(draw_scenes(self.stream.options, self.stream.seed, part))
+                drawn = leaves(draw_scenes(*self.seeded, part))
                 if not self._ahead:
                     self._ahead = [leaf.new_empty(count, *leaf.shape[1:]) for leaf in drawn]
                 for leaf, rows in zip(self._ahead, drawn, strict=True):

@@ -17,7 +17,7 @@ from ifo_grounding.seeding import generator
 from ifo_grounding.stats import Described, Estimate, Rate, auc, reliability, wilson
 from ifo_grounding.tasks.goals import MAX_STEPS, REASONS, Goal, verdict
 from ifo_grounding.tasks.grammar import FIELDS, grammar
-from ifo_grounding.tasks.scenes import SceneOptions, SceneStream
+from ifo_grounding.tasks.scenes import SceneOptions, draw_scenes
 from ifo_grounding.tasks.vocabulary import VOCABULARY
 from ifo_grounding.transforms.base import check_pool
 from ifo_grounding.transforms.choosing import PoolScorer
@@ -116,11 +116,10 @@ def suitable_rate(
     options = SceneOptions(
         task, instructed=False, stream=stream, max_steps=max_steps, **scene_options
     )
-    scenes = SceneStream(options, seed, device)
     how: dict[str, Any] = {"threshold": threshold, "candidates": candidates, "choose": choose}
     found, pairs = [], []
     for numbers in torch.arange(states, device=device).split(batch_size):
-        state = scenes.scenes(numbers).state
+        state = draw_scenes(options, seed, numbers).state
         pixels = render(state, tile_size)
         chosen, score = scorer.choose(pixels, generator=draw, **how)
         reason = verdict(state, goals[chosen.clamp_min(0)], max_steps)

@@ -24,14 +24,12 @@ class GoalLoss(SupervisedLoss):
     their instructions. Negatives are, with half the weight each, earlier frames with their
     instructions, and final frames with others of the pool. Positives and negatives weigh the same;
     a class that a batch lacks counts 0. Writes ``loss_goal``, ``final_probability``,
-    ``unfinished_probability``, ``negative_probability`` and ``removed``.
+    ``unfinished_probability`` and ``negative_probability``.
 
     Args:
         network: first image, image and instruction to a logit, as ``make_goal_classifier`` builds.
         pool: token ids [P, L] of the instructions of the demonstrations.
-        negatives: how many other instructions each final frame is scored with. For
-            ``removal_rate``, ``warmup`` and ``near`` see
-            :class:`~ifo_grounding.objectives.NegativeInstructions`.
+        negatives: how many other instructions each final frame is scored with.
 
     >>> from ifo_grounding.networks import Shapes, make_goal_classifier
     >>> pool = torch.arange(1, 13).unsqueeze(1).expand(12, 16)
@@ -57,31 +55,12 @@ class GoalLoss(SupervisedLoss):
         "final_probability",
         "unfinished_probability",
         "negative_probability",
-        "removed",
     ]
 
-    def __init__(
-        self,
-        network: TensorDictModule,
-        pool: Tensor,
-        *,
-        negatives: int = 8,
-        removal_rate: float | None = 0.0,
-        warmup: float = 1 / 3,
-        near: float = 0.0,
-    ) -> None:
+    def __init__(self, network: TensorDictModule, pool: Tensor, *, negatives: int = 8) -> None:
         super().__init__(network)
         self.count = at_least_one("negatives", negatives)
-        self.negatives = NegativeInstructions(pool, removal_rate, warmup, near)
-
-    def set_progress(self, fraction: float) -> None:
-        """Say which share of training is done, in [0, 1]; until told, training counts as late."""
-        self.negatives.progress = fraction
-
-    @property
-    def capturable(self) -> bool:
-        """Whether a step can be captured: removal would have to count what it drops."""
-        return self.negatives.keeps_all and super().capturable
+        self.negatives = NegativeInstructions(pool, removal_rate=0.0)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -101,18 +80,14 @@ class GoalLoss(SupervisedLoss):
                 last, before, told = (
                     torch.ones_like(each, dtype=torch.bool) for each in (own, early, other)
                 )
-        if self.training:
-            self.negatives.watch(own, other[:, : self.negatives.uniform(self.count)])
-        kept = told & self.negatives.keep(other)
         finished = masked_mean(F.softplus(-own), last)
         unfinished = masked_mean(F.softplus(early), before)
-        elsewhere = masked_mean(F.softplus(other), kept)
+        elsewhere = masked_mean(F.softplus(other), told)
         return TensorDict(
             {
                 "loss_goal": (finished + (unfinished + elsewhere) / 2) / 2,
                 "final_probability": masked_mean(own.detach().sigmoid(), last),
                 "unfinished_probability": masked_mean(early.detach().sigmoid(), before),
                 "negative_probability": masked_mean(other.detach().sigmoid(), told),
-                "removed": masked_mean((~kept).float(), told),
             }
         )

@@ -5,13 +5,12 @@ from ifo_grounding.tasks.goals import (
     TASKS,
     Goal,
     Plan,
-    achieved,
     fulfilled,
     plan,
     verdict,
 )
 from ifo_grounding.tasks.grammar import N_TEMPLATES, Grammar, grammar
-from ifo_grounding.tasks.scenes import Scene, SceneOptions, SceneStream
+from ifo_grounding.tasks.scenes import Scene, SceneOptions, draw_scenes
 from ifo_grounding.tasks.vocabulary import VOCABULARY, Vocabulary
 
 __all__ = [
@@ -24,9 +23,8 @@ __all__ = [
     "Plan",
     "Scene",
     "SceneOptions",
-    "SceneStream",
     "Vocabulary",
-    "achieved",
+    "draw_scenes",
     "fulfilled",
     "grammar",
     "plan",

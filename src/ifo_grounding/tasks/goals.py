@@ -135,21 +135,15 @@ def verdict(state: WorldState, goal: Goal, max_steps: int = MAX_STEPS) -> Tensor
 
 
 def fulfilled(final: WorldState, wanted: Plan) -> Tensor:
-    """Say whether a state fulfils a resolved goal, bool [*B]."""
+    """Say whether a final state fulfils a goal that was resolved in the initial one, bool [*B].
+
+    The relation has to hold, the hand has to be empty, and every other object has to be where it
+    began. A goal whose referents are missing, ambiguous, occupied or off the grid never is.
+    """
     resolved = (wanted.verdict == SUITABLE) | (wanted.verdict >= ALREADY_TRUE)
     in_place = _equal(final.objects, wanted.objects)
     there = wanted.carries | (final.arm == wanted.destination)
     return resolved & in_place & there & (final.held == 0)
-
-
-def achieved(initial: WorldState, final: WorldState, goal: Goal) -> Tensor:
-    """Say whether an episode fulfilled its goal, bool [*B].
-
-    What the goal refers to is resolved in ``initial``. In ``final`` the relation has to hold, the
-    hand has to be empty, and every other object has to be where it began. A goal whose referents
-    are missing, ambiguous, occupied or off the grid cannot be achieved.
-    """
-    return fulfilled(final, plan(initial, goal))
 
 
 def _equal(left: Tensor, right: Tensor) -> Tensor:

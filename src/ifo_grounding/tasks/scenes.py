@@ -106,6 +106,7 @@ class _Proposal(TensorClass):
     wording: Tensor
 
 
+@torch.inference_mode(False)
 def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
     """Draw the scenes with the given numbers, int64 [N], where the numbers lie.
 
@@ -114,6 +115,10 @@ def draw_scenes(options: SceneOptions, seed: int, numbers: Tensor) -> Scene:
 
     Raises:
         UserError: where hardly any scene has a suitable goal.
+
+    >>> scenes = draw_scenes(SceneOptions("pick"), 0, torch.tensor([5, 2000]))
+    >>> scenes.instruction.shape, scenes.wanted.verdict.tolist()
+    (torch.Size([2, 16]), [0, 0])
     """
     key = derive(seed, "scenes", options.stream)
     if not options.instructed:
@@ -205,23 +210,3 @@ def propose_goal(state: WorldState, task: int, lots: Lots) -> Goal:
         side=side,
         batch_size=nothing.shape,
     )
-
-
-class SceneStream:
-    """The scenes of one seed, each of which can be drawn again by its number.
-
-    >>> stream = SceneStream(SceneOptions("pick"), seed=0)
-    >>> scenes = stream.scenes(torch.tensor([5, 2000]))
-    >>> scenes.instruction.shape, scenes.wanted.verdict.tolist()
-    (torch.Size([2, 16]), [0, 0])
-    """
-
-    def __init__(
-        self, options: SceneOptions, seed: int, device: torch.device | str | None = None
-    ) -> None:
-        self.options, self.seed, self.device = options, seed, torch.device(device or "cpu")
-
-    @torch.inference_mode(False)
-    def scenes(self, numbers: Tensor) -> Scene:
-        """Return the scenes with the given numbers, int64 [N] from 0 on."""
-        return draw_scenes(self.options, self.seed, numbers.to(self.device))
