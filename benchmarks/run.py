@@ -15,8 +15,8 @@ from pathlib import Path
 
 import torch
 
-from ifo_grounding.allocation import keep_freed_memory
 from ifo_grounding.files import read_json, write_json
+from ifo_grounding.machine import keep_freed_memory
 from ifo_grounding.report import provenance, text_table
 
 HERE = Path(__file__).parent

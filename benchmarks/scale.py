@@ -22,14 +22,14 @@ from measuring import ROOT, Row, timed
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 
-from ifo_grounding import networks
+from ifo_grounding import keys, networks
 from ifo_grounding.cluster import Call, run_on_cluster
 from ifo_grounding.data import labelled_buffer, record_demonstrations
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.report import provenance
 from ifo_grounding.training import FitConfig, SelfExaminationConfig, fit
-from ifo_grounding.training.collection import AFTER, FIRST, LEFT_OUT, Here, OnRay, ends
+from ifo_grounding.training.collection import FIRST, LEFT_OUT, Here, OnRay, ends
 from ifo_grounding.training.policy_gradient import Learner
 from ifo_grounding.transforms import GoalReward, InstructionSampler
 from ifo_grounding.worlds import BabyAI
@@ -125,7 +125,7 @@ def model() -> Row:
         seconds["collect"].append(collected - begun)
         seconds["learn"].append(time.process_time() - collected)
     micro = {name: 1e6 * statistics.median(each[1:]) / frames for name, each in seconds.items()}
-    sent, pixels = batch.exclude(*LEFT_OUT, *FIRST, AFTER), batch[AFTER]
+    sent, pixels = batch.exclude(*LEFT_OUT, *FIRST, keys.NEXT_PIXELS), batch[keys.NEXT_PIXELS]
     left = pixels[ends(batch)].nbytes
     weights = [*policy.parameters(), *env.transform.parameters()]
     facts = {

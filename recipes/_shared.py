@@ -16,13 +16,12 @@ from torch import Tensor
 from torchrl import torchrl_logger
 
 from ifo_grounding import networks
-from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport, show_codes
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import read_json, write_json, write_record
-from ifo_grounding.machine import machine_of
+from ifo_grounding.machine import keep_freed_memory, machine_of, release_freed_memory
 from ifo_grounding.options import plain
 from ifo_grounding.progress import tell_progress
 from ifo_grounding.training import FitConfig, Run, Stage, Trial, fit

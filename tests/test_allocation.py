@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ifo_grounding.allocation import keep_freed_memory, release_freed_memory
+from ifo_grounding.machine import keep_freed_memory, release_freed_memory
 
 
 def new_pages(rounds):

@@ -14,7 +14,7 @@ from ifo_grounding import keys
 
 PACKAGE = Path(keys.__file__).parent
 ORDER = (
-    ("keys", "texts", "errors", "seeding", "files", "machine", "allocation"),
+    ("keys", "texts", "errors", "seeding", "files", "machine"),
     ("channels", "cluster", "distinct", "mosaic", "progress"),
     ("world",),
     ("tasks",),

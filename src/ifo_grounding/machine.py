@@ -1,8 +1,9 @@
-"""What computes: a device, its name, and how many cores there are."""
+"""What computes: a device, its name, how many cores there are, and how memory is handed out."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import platform
 from pathlib import Path
@@ -12,6 +13,8 @@ import torch
 from ifo_grounding.errors import UserError
 
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
+TRIM_THRESHOLD, MMAP_MAX = -1, -4
+"""Names of glibc's parameters, from malloc.h."""
 
 
 def machine_of(device: torch.device | str) -> str:
@@ -53,3 +56,22 @@ def check_device(device: torch.device | str) -> None:
         raise UserError(f"device={device} is none: use cpu, cuda or cuda:0")
     if kind == "cuda" and (torch.device(device).index or 0) >= torch.cuda.device_count():
         raise UserError(f"device={device}: torch sees no such GPU here; use device=cpu")
+
+
+def keep_freed_memory() -> None:
+    """Let the C library, where it is glibc, keep the memory that is freed, to hand it out again.
+
+    Otherwise a tensor of megabytes costs more to get from the system than to fill. Call it once,
+    before the work begins. The process then holds on to the most that it ever needed, and to more
+    where sizes differ: :func:`release_freed_memory` gives back what is free.
+    """
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(MMAP_MAX, 0)
+        mallopt(TRIM_THRESHOLD, 2**31 - 1)
+
+
+def release_freed_memory() -> None:
+    """Let glibc give back the memory that is free now, also between blocks that are in use."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -13,10 +13,11 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth, labelled_buffer
 from ifo_grounding.data.buffers import frame_buffer
+from ifo_grounding.envs.base import begin
 from ifo_grounding.errors import UserError
 from ifo_grounding.seeding import generator
 
-AFTER, ENDED = (keys.NEXT, keys.PIXELS), (keys.NEXT, "terminated")
+ENDED = (keys.NEXT, "terminated")
 
 
 def transitions_of(demos: Demonstrations, last: bool = False) -> TensorDictReplayBuffer:
@@ -33,9 +34,9 @@ def transitions_of(demos: Demonstrations, last: bool = False) -> TensorDictRepla
     ended = demos.closed[episode] & (frame == (demos.starts + demos.lengths - 2)[episode])
     if last:
         episode, frame, ended = episode[ended], frame[ended], ended[ended]
-    stored = {keys.PIXELS: frame, AFTER: frame + 1, keys.INSTRUCTION: episode}
+    stored = {keys.PIXELS: frame, keys.NEXT_PIXELS: frame + 1, keys.INSTRUCTION: episode}
     stored[ENDED] = ended.unsqueeze(-1)
-    return frame_buffer(demos, stored, [keys.PIXELS, AFTER])
+    return frame_buffer(demos, stored, [keys.PIXELS, keys.NEXT_PIXELS])
 
 
 def check_access(method: object, seen: object, allowed: type) -> None:
@@ -45,13 +46,6 @@ def check_access(method: object, seen: object, allowed: type) -> None:
             f"{type(method).__name__} uses {allowed.__name__}, no more and no less, got "
             f"{type(seen).__name__}"
         )
-
-
-def begin(env: EnvBase, scenes: Tensor) -> TensorDictBase:
-    """Reset every row to a scene by its number, int64 [R]; rows beyond R show scene 0."""
-    rows = env.batch_size.numel()
-    numbers = torch.cat([scenes, scenes.new_zeros(rows - len(scenes))]).to(env.device or "cpu")
-    return env.reset(TensorDict({keys.SCENE: numbers.view(*env.batch_size, 1)}, env.batch_size))
 
 
 @dataclass(frozen=True)

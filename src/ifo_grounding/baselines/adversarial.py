@@ -19,7 +19,6 @@ from torchrl.data import TensorDictReplayBuffer
 
 from ifo_grounding import keys
 from ifo_grounding.baselines.access import (
-    AFTER,
     ENDED,
     ActionDemonstrations,
     SteppableDemonstrations,
@@ -115,7 +114,7 @@ class DiscriminatorReward(RewardTransform):
     """
 
     def __init__(self, discriminator: TensorDictModuleBase, at_stop: int | None = None) -> None:
-        self.later = [key in (AFTER, ENDED) for key in discriminator.in_keys]
+        self.later = [key in (keys.NEXT_PIXELS, ENDED) for key in discriminator.in_keys]
         read = [
             key[-1] if later else key
             for key, later in zip(discriminator.in_keys, self.later, strict=True)
@@ -259,7 +258,7 @@ class GAIfO(Adversary):
         inverse = options.pop("inverse", None) or make_inverse(shapes, preset, **options)
         reward = make_reward_model(shapes, preset, **options)
         network = ChangeNetwork(inverse.module, reward.module, self.stop_action)
-        in_keys = [keys.PIXELS, AFTER, ENDED, keys.INSTRUCTION]
+        in_keys = [keys.PIXELS, keys.NEXT_PIXELS, ENDED, keys.INSTRUCTION]
         return TensorDictModule(network, in_keys, ["change_score"]).eval()
 
 
@@ -277,7 +276,7 @@ class AGILE(Adversary):
         return transitions_of(frames_of(seen), last=True)
 
     def discriminator(self, shapes: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
-        in_keys = (AFTER, keys.INSTRUCTION)
+        in_keys = (keys.NEXT_PIXELS, keys.INSTRUCTION)
         return make_instruction_classifier(shapes, preset, in_keys=in_keys, **options)
 
     def paid(self) -> DiscriminatorReward:  # noqa: D102

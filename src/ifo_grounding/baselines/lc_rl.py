@@ -19,9 +19,9 @@ from torchrl.envs import EnvBase
 from ifo_grounding import keys
 from ifo_grounding.baselines.access import (
     SteppableActionDemonstrations,
-    begin,
     check_access,
 )
+from ifo_grounding.envs.base import begin
 from ifo_grounding.episodes import play
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import evaluating

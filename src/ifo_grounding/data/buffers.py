@@ -17,8 +17,6 @@ from ifo_grounding.data.decoding import FrameDecoder, Lookup
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.errors import UserError
 
-FINAL = "final"
-
 
 def first_frame_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer:
     """Put first frames and instructions into a replay buffer, for the instruction classifier.
@@ -74,7 +72,7 @@ def goal_buffer(demos: Demonstrations, **options: Any) -> TensorDictReplayBuffer
         keys.INITIAL_PIXELS: demos.starts[episodes],
         keys.PIXELS: torch.cat([frame[earlier], last[finished]]),
         keys.INSTRUCTION: episodes,
-        FINAL: final,
+        keys.FINAL: final,
     }
     return frame_buffer(demos, stored, [keys.INITIAL_PIXELS, keys.PIXELS], **options)
 

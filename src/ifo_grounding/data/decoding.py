@@ -12,7 +12,7 @@ from torchrl.envs import Transform
 from ifo_grounding import keys, mosaic
 from ifo_grounding.data.codec import FrameCodec
 
-FRAME_KEYS: tuple[NestedKey, ...] = (keys.PIXELS, (keys.NEXT, keys.PIXELS))
+FRAME_KEYS: tuple[NestedKey, ...] = (keys.PIXELS, keys.NEXT_PIXELS)
 
 
 class Lookup(Transform):

@@ -14,11 +14,11 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from ifo_grounding import keys
-from ifo_grounding.allocation import release_freed_memory
-from ifo_grounding.data.buffers import FINAL, check_demonstrations, frame_buffer
+from ifo_grounding.data.buffers import check_demonstrations, frame_buffer
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import damaged, load_folder, save_folder
 from ifo_grounding.errors import UserError, at_least_one
+from ifo_grounding.machine import release_freed_memory
 from ifo_grounding.modules import device_of, evaluating
 from ifo_grounding.progress import progress_bar
 
@@ -164,7 +164,7 @@ def labelled_buffer(
         keys.PIXELS: frame,
         keys.INSTRUCTION: episode,
         keys.ACTION: actions.long(),
-        FINAL: (frame == last[episode]).unsqueeze(-1),
+        keys.FINAL: (frame == last[episode]).unsqueeze(-1),
     }
     return frame_buffer(demos, stored, [keys.PIXELS], **options)
 
@@ -175,7 +175,7 @@ def _logits(
     """Return the logits [B, A] of transitions that begin with some frames, int64 [B]."""
     read = [unravel_key(key) for key in getattr(inverse, "in_keys", ())]
     if len(read) != 2:
-        read = [keys.PIXELS, (keys.NEXT, keys.PIXELS)]
+        read = [keys.PIXELS, keys.NEXT_PIXELS]
     later_first = isinstance(read[0], tuple) and read[0][0] == keys.NEXT
     numbers = [frame + 1, frame] if later_first else [frame, frame + 1]
     reads_tiles = getattr(getattr(inverse, "module", None), "reads_tiles", None)

@@ -109,7 +109,7 @@ class Collected(NamedTuple):
         codec = next(part for part in self.buffer.transform if isinstance(part, FrameDecoder)).codec
         arrays = {
             "pixels": stored[keys.PIXELS],
-            "next_pixels": stored[keys.NEXT, keys.PIXELS],
+            "next_pixels": stored[keys.NEXT_PIXELS],
             "action": stored[keys.ACTION],
             "taken": self.report.taken,
             "kept": self.report.kept,
@@ -193,7 +193,7 @@ def collect_transitions(
         """Yield frames and next frames in turns, uint8 [2 K, C, H, W], of the K kept steps."""
         for batch in _collect(env, policy or chance, n, progress):
             action = batch[keys.ACTION].cpu()
-            pair = torch.stack([batch[keys.PIXELS], batch[keys.NEXT, keys.PIXELS]], 1).cpu()
+            pair = torch.stack([batch[keys.PIXELS], batch[keys.NEXT_PIXELS]], 1).cpu()
             taken.add_(action.bincount(minlength=len(taken)))
             if drop_unchanged:
                 keep = (pair[:, 0] != pair[:, 1]).flatten(1).any(1)
@@ -244,7 +244,7 @@ def _collect(
             for number, batch in enumerate(collector):
                 if not number:
                     _compare_workers(env, batch[keys.PIXELS][..., 0, :, :, :])
-                read = batch.select(keys.PIXELS, keys.ACTION, (keys.NEXT, keys.PIXELS))
+                read = batch.select(keys.PIXELS, keys.ACTION, keys.NEXT_PIXELS)
                 yield read.reshape(-1)[:remaining]
                 bar.update(min(frames, remaining))
                 remaining -= min(frames, remaining)

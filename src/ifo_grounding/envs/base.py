@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -15,6 +15,13 @@ from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 DONE = ("done", "terminated", "truncated")
+
+
+def begin(env: EnvBase, scenes: Tensor) -> TensorDictBase:
+    """Reset every row to a scene by its number, int64 [R]; rows beyond R repeat the first one."""
+    rows = env.batch_size.numel()
+    numbers = torch.cat([scenes, scenes[:1].expand(rows - len(scenes))]).to(env.device or "cpu")
+    return env.reset(TensorDict({keys.SCENE: numbers.view(*env.batch_size, 1)}, env.batch_size))
 
 
 class NumberedEnv(EnvBase):

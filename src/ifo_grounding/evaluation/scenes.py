@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys, modules
 from ifo_grounding.attributes import attribute
 from ifo_grounding.envs import GymnasiumEnv, PickAndPlaceEnv
+from ifo_grounding.envs.base import begin
 from ifo_grounding.episodes import Outcomes, Policy, play
 from ifo_grounding.errors import UserError, at_least_one, check_choice, whole
 from ifo_grounding.seeding import STREAMS, derive
@@ -95,10 +96,7 @@ def _numbered(
     """Yield an environment, what its reset to scenes returned, and how many of its rows count."""
     rows = env.batch_size.numel()
     for chosen in torch.as_tensor(numbers, device=env.device).split(rows):
-        # The last batch is filled up with copies of its first scene, which do not count.
-        padded = torch.cat([chosen, chosen[:1].expand(rows - len(chosen))])
-        scene = TensorDict({keys.SCENE: padded.unsqueeze(-1)}, batch_size=[rows], device=env.device)
-        yield env, env.reset(scene), len(chosen)
+        yield env, begin(env, chosen), len(chosen)
 
 
 def _batches_of(

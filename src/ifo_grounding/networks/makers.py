@@ -105,7 +105,7 @@ def make_inverse(
     spec_source: Any,
     preset: str = "strong",
     *,
-    in_keys: Sequence[NestedKey] = (keys.PIXELS, (keys.NEXT, keys.PIXELS)),
+    in_keys: Sequence[NestedKey] = (keys.PIXELS, keys.NEXT_PIXELS),
     out_key: NestedKey = keys.LOGITS,
     device: torch.device | str | None = None,
     seed: int | None = None,

@@ -46,7 +46,7 @@ class GoalLoss(SupervisedLoss):
     class _AcceptedKeys:
         """Keys that ``set_keys`` changes; the inputs' keys are the network's."""
 
-        final: NestedKey = "final"
+        final: NestedKey = keys.FINAL
         """Whether a frame is the last of its demonstration, bool [*B, 1]."""
 
     written = keys.GOAL_SCORE

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.envs.base import begin
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Trace, record_episodes, trace_episode
 from ifo_grounding.modules import TURNS, evaluating, output_key
@@ -263,7 +264,7 @@ class Agent:
         if not self.arranges:
             return []
         if state is None:
-            self._env.reset(TensorDict({keys.SCENE: torch.tensor([[scene]])}, [1]))
+            begin(self._env, torch.tensor([scene]))
             state = self._env.truth.state.clone()
         return list(accumulate(torch.as_tensor(actions).unsqueeze(-1), step, initial=state))
 

@@ -106,7 +106,7 @@ class Lesson:
             raise UserError(f"that is {MOST_STEPS} steps: stop, or begin anew")
         stepped = self._env.step(self._state.set(keys.ACTION, torch.tensor([action])))
         self._state = self._env.step_mdp(stepped)
-        frame = stepped[keys.NEXT, keys.PIXELS][0].cpu().numpy().copy()
+        frame = stepped[keys.NEXT_PIXELS][0].cpu().numpy().copy()
         ended = bool(stepped[keys.NEXT, "done"])
         if stops or not np.array_equal(frame, self._frames[-1]):
             self._frames.append(self._frames[-1] if stops else frame)

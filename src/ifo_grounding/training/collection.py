@@ -24,7 +24,6 @@ LEFT_OUT = (keys.REWARD, (keys.NEXT, keys.REWARD))
 """The simulator's own reward, which no learner sees."""
 FIRST = (keys.INITIAL_PIXELS, (keys.NEXT, keys.INITIAL_PIXELS))
 """What the goal reward carries along, which no update reads."""
-AFTER = (keys.NEXT, keys.PIXELS)
 PATIENCE = 60.0
 """Seconds in which a cluster has to find room for all workers."""
 TRIES = 3
@@ -74,8 +73,8 @@ class Worker(Collector):
         reseed(self.env, seed)
         batch = self.next()
         return (
-            batch.exclude(*LEFT_OUT, *FIRST, AFTER),
-            batch[AFTER][ends(batch)],
+            batch.exclude(*LEFT_OUT, *FIRST, keys.NEXT_PIXELS),
+            batch[keys.NEXT_PIXELS][ends(batch)],
             sampler_stats(self.env),
         )
 
@@ -190,7 +189,7 @@ def _joined(batches: Sequence[TensorDictBase], last: Sequence[Tensor]) -> Tensor
     batch: TensorDictBase = torch.cat(list(batches))
     after = batch[keys.PIXELS].roll(-1, 1)
     after[ends(batch)] = torch.cat(list(last))
-    return batch.set(AFTER, after)
+    return batch.set(keys.NEXT_PIXELS, after)
 
 
 def _weights(policy: nn.Module, env: EnvBase) -> list[Tensor]:

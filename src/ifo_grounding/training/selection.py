@@ -15,7 +15,6 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
 from ifo_grounding import keys
-from ifo_grounding.data.buffers import FINAL
 from ifo_grounding.episodes import play
 from ifo_grounding.errors import UserError
 from ifo_grounding.modules import beside, evaluating, exploring
@@ -130,7 +129,7 @@ class HeldOutAccuracy:
                 seen = beside(self.buffer[rows], self.policy)
                 label = seen.pop(keys.ACTION)
                 right.append((self.policy(seen)[keys.ACTION] == label).float().cpu())
-                final.append(seen[FINAL].squeeze(-1).long().cpu())
+                final.append(seen[keys.FINAL].squeeze(-1).long().cpu())
         ended = torch.cat(final)
         demonstration = ended.cumsum(0) - ended
         counted = torch.stack([torch.cat(right), torch.ones(len(ended))])

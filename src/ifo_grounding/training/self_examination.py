@@ -14,9 +14,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.allocation import release_freed_memory
 from ifo_grounding.attributes import first_worker, untransformed
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
+from ifo_grounding.machine import release_freed_memory
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
 from ifo_grounding.training.checkpoint import Checkpoint

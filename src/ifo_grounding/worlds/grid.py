@@ -9,12 +9,12 @@ from typing import Any
 
 import torch
 from omegaconf import MISSING
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from ifo_grounding import keys
 from ifo_grounding.data import Demonstrations, Truth, record_demonstrations
 from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.envs.base import begin
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Endings, SuitabilityResult, episode_endings, suitable_rate
 from ifo_grounding.seeding import derive
@@ -133,7 +133,7 @@ class Grid(Tiled):
         """Say whether an instruction suits a scene or a state, ``suitable``, or why not."""
         if state is None:
             env = self.instructed(1, seed=seed, stream=stream)
-            env.reset(TensorDict({keys.SCENE: torch.tensor([[scene]])}, [1]))
+            begin(env, torch.tensor([scene]))
             state = env.truth.state
         goal = grammar(self.task).parse_tokens(instruction.reshape(1, -1))
         return REASONS[int(verdict(state, goal))]
