@@ -131,10 +131,7 @@ def world_of(options: Options) -> World:
         cause = error.__cause__ or error
         if isinstance(cause, UserError):
             raise UserError(f"world: {cause}") from None
-        raise UserError(
-            f"world._target_={spec.get('_target_')} cannot be made with "
-            f"{ {k: v for k, v in spec.items() if k != '_target_'} }: {cause}"
-        ) from None
+        raise UserError(f"world._target_={spec.get('_target_')} cannot be made: {cause}") from None
     if not isinstance(world, World):
         raise UserError(f"world._target_={spec['_target_']} is no ifo_grounding.worlds.World")
     if judged is not None:

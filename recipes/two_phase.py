@@ -31,9 +31,10 @@ from report import report
 
 def two_phase(options: Options) -> dict:
     last = STAGES.index(options.until or STAGES[-1])
+    judged = world_of(options).judged  # a world that cannot be made is refused before all else
     print(
         f"{one_line(options.task)}, {options.demonstrations.n:,} demonstrations: about "
-        f"{math.ceil(expected_minutes(options))} minutes of a core; what is interrupted goes on",
+        f"{math.ceil(expected_minutes(options))} min of a core; what is interrupted goes on",
         flush=True,
     )
     for name, stage in stages_of(options).items():
@@ -42,7 +43,7 @@ def two_phase(options: Options) -> dict:
         if name == "record_demonstrations" and (reason := phase_1_alone(options)):
             print(f"phase 1 alone: {reason}", flush=True)
             last = min(last, STAGES.index("imitate"))
-    if last < STAGES.index("imitate") or not world_of(options).judged:
+    if last < STAGES.index("imitate") or not judged:
         return {}
     if options.controls.run and last == len(STAGES) - 1:
         continue_imitation(options)

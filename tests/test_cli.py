@@ -1,6 +1,7 @@
 """The command line, and what makes a function a recipe: mistakes get one line and exit code 2."""
 
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -88,7 +89,7 @@ def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
         ("run", "which recipe? choose one of greet"),
         ("run great", "unknown recipe 'great' (did you mean 'greet'?): choose one of 'greet'"),
         ("run greet tsk=move", "unknown option 'tsk' (did you mean 'task'?): there are "),
-        ("run greet --resolve", "lexernoviablealtexception"),
+        ("run greet --resolve", "--resolve: options are written name=value"),
         ("run greet task=fly", "unknown task 'fly': choose move or pick"),
         ("run greet -m preset=paper,huge", "unknown preset 'huge': choose one of paper, strong"),
     ],
@@ -148,6 +149,8 @@ def test_help_of_a_recipe_shows_what_it_reads_and_has_of_its_own(capsys):
     printed = capsys.readouterr().out
     assert "\n  imitate.lr=" in printed and "\n  networks.dropout=" in printed
     assert "self_examine" not in printed and "ifo-grounding demo --help" in printed
+    assert run("demo", "--help") == 0
+    assert re.search(r"world\.size=6 +Cells along one side", capsys.readouterr().out)
     assert run("run", "reproduce", "table=2", "--help") == 0
     printed = capsys.readouterr().out
     assert "\n  table=2 " in printed and "Of the paper: 1, with a success" in printed

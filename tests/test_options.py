@@ -25,7 +25,10 @@ def sections():
     ("wrong", "said"),
     [
         ("tsk=move", r"unknown option 'tsk' \(did you mean 'task'\?\): there are "),
-        ("imitate.stps=1", r"unknown option 'imitate.stps' \(did you mean 'steps'\?\): 'imitate'"),
+        (
+            "imitate.stps=1",
+            r"unknown option 'imitate.stps' \(did you mean 'imitate.steps'\?\): 'imitate'",
+        ),
         ("seed=many", "option seed: value 'many' .* could not be converted to Integer"),
         ("seed=null", "option seed: field 'seed' is not Optional"),
         ("imitate.steps=1.5", "option imitate.steps: value '1.5'"),
@@ -124,11 +127,13 @@ def test_few_demonstrations_take_a_budget_of_their_own_unless_one_is_named(tmp_p
 
 def test_a_run_goes_on_with_its_own_options(tmp_path):
     run = f"run={tmp_path / 'run'}"
-    made = options_of("preset=paper", "demonstrations.n=100", "seed=3", run)
+    paper = ("preset=paper", "demonstrations.n=100", "seed=3")
+    made = options_of(*paper, "evaluate.states=30", "until=label", run)
     Run(made.run).begin(plain(made), FREE)
     again = options_of(run, "evaluate.episodes=70", "threads=2")
     assert (again.preset, again.demonstrations.n, again.seed) == ("paper", 100, 3)
-    assert (again.evaluate.episodes, again.threads) == (70, 2)
+    assert (again.evaluate.episodes, again.evaluate.states, again.threads) == (70, 30, 2)
+    assert again.until is None
     assert again.imitate == made.imitate
     for named in ("preset=strong", "imitate.lr=0.5"):
         other = options_of(run, named)

@@ -33,11 +33,12 @@ STAGES = (
     "self_examine",
 )
 """Stages of a run, in order."""
-FREE = (
+PASSING = (
     *("run", "base", "until", "results", "variant", "to", "hub", "controls.run", "references"),
-    *("device", "threads", "logger", "progress", "checkpoint_seconds", "evaluate"),
-    *("method", "baseline", "ray"),
+    *("device", "threads", "logger", "progress", "checkpoint_seconds", "method", "ray"),
 )
+"""Options of one command, which a run does not keep."""
+FREE = (*PASSING, "evaluate", "baseline")
 """Options, or sections, that decide nothing of what a run learns: they may change as it goes on."""
 
 

@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import inspect
 import itertools
+import pkgutil
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from ifo_grounding.cli import recipes_folder
-from ifo_grounding.config import FREE, Options
+from ifo_grounding.config import PASSING, Options
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.data.lerobot import INFO
 from ifo_grounding.data.pictures import LIST, read_list
@@ -151,9 +152,9 @@ def _combinations(words: Sequence[str]) -> list[list[str]]:
 def _settled(overrides: Sequence[str]) -> Options:
     """Return composed options as dataclasses: those of the run, where it has begun.
 
-    What a run was made with wins over what a command does not name, but for what decides nothing of
-    what it learns (:data:`~ifo_grounding.config.FREE`); what it names otherwise is refused where
-    the run is opened.
+    What a run was made with wins over what a command does not name, but for what is of one command
+    (:data:`~ifo_grounding.config.PASSING`); what it names otherwise is refused where the run is
+    opened, unless it is free.
     """
     words = [quoted(word) for word in overrides]
     named = {e.key_or_group: e.value() for e in OverridesParser.create().parse_overrides(words)}
@@ -189,7 +190,7 @@ def _demonstrations(cfg: DictConfig) -> int:
 
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Iterable[str]) -> DictConfig:
-    """Return a run's options, but for those that are free and those that a command names."""
+    """Return a run's options, but for those of one command and those that a command names."""
     known = leaves(plain(cfg))
     for name in leaves(made):
         if name not in known and not name.startswith("world."):
@@ -198,7 +199,7 @@ def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Iterable[str]) -> Dic
                 "give another run=, or go on with the version that made it"
             )
     result = OmegaConf.create({**plain(cfg), **made})
-    for name in [*FREE, *named]:
+    for name in [*PASSING, *named]:
         OmegaConf.update(result, name, plain(OmegaConf.select(cfg, name)), merge=False)
     return result
 
@@ -246,13 +247,13 @@ def explained(error: Exception) -> UserError:
         hint = did_you_mean(given, allowed)
         return UserError(f"unknown {group} {given!r}{hint}: choose one of {', '.join(allowed)}")
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)) and cause.full_key:
-        section, _, name = cause.full_key.rpartition(".")
+        section, dot, _ = cause.full_key.rpartition(".")
         parent = cause.parent_node
         names = sorted({*map(str, parent or ())} - {"hydra"})
         where = f"{section!r} has" if section else "there are"
-        hint = did_you_mean(name, names)
+        hint = did_you_mean(cause.full_key, [f"{section}{dot}{name}" for name in names])
         return UserError(f"unknown option {cause.full_key!r}{hint}: {where} {', '.join(names)}")
-    said = str(cause).splitlines()[0]
+    said = re.sub(r"^\w+Exception: ", "", str(cause).splitlines()[0])
     if said.startswith("Ambiguous"):
         return UserError(f"{said}: several values need --multirun, a comma in one \"'a,b'\"")
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
@@ -290,13 +291,21 @@ def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[s
             if typed:
                 yield from described(inner, value, f"{name}.")
             else:
-                yield from (f"  {name}.{key}={written(v)}" for key, v in leaves(value).items())
-            continue
-        text = f"{name}={written(value)}"
-        meaning = textwrap.wrap(docs.get(each.name, ""), 62) or [""]
-        fits = len(text) <= 36
-        yield f"  {text:<36}  {meaning[0]}".rstrip() if fits else f"  {text}"
-        yield from (f"{'':<40}{more}" for more in meaning[fits:])
+                told: dict[str, str] = {}
+                with contextlib.suppress(Exception):  # whatever an own module raises
+                    told = field_docs(pkgutil.resolve_name(value["_target_"]))
+                for key, inner in leaves(value).items():
+                    yield from _row(f"{name}.{key}={written(inner)}", told.get(key, ""))
+        else:
+            yield from _row(f"{name}={written(value)}", docs.get(each.name, ""))
+
+
+def _row(text: str, meaning: str) -> Iterator[str]:
+    """Write an option beside what it means."""
+    lines = textwrap.wrap(meaning, 62) or [""]
+    fits = len(text) <= 36
+    yield f"  {text:<36}  {lines[0]}".rstrip() if fits else f"  {text}"
+    yield from (f"{'':<40}{more}" for more in lines[fits:])
 
 
 def field_docs(kind: type) -> dict[str, str]:

@@ -196,6 +196,10 @@ def test_what_is_wrong_with_an_episode_is_said_with_its_name(frames, sentence, s
 def test_other_things_than_episodes_are_refused(episode, said):
     with pytest.raises(UserError, match=f"^episode 1 is {said}: give a tuple of three, name"):
         data.Demonstrations.from_episodes([("a", GOOD, "go"), episode])
+    with pytest.raises(UserError, match=r"^episode 0 is named by a ndarray: give name, frames"):
+        data.Demonstrations.from_episodes([(GOOD, "go", "a")])
+    with pytest.raises(UserError, match="a sentence for each episode, got one text"):
+        data.Demonstrations.from_arrays([GOOD, GOOD], "go")
 
 
 def test_instructions_are_as_long_as_the_longest_as_told_or_as_the_vocabulary_s(tmp_path):

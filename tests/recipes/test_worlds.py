@@ -123,10 +123,10 @@ def test_what_nobody_judges_is_trained_and_then_played(options, tmp_path, monkey
     [
         (["world=own", "world._target_=own_dial.Dial"], "is no ifo_grounding.worlds.World"),
         (["world=own", "world._target_=nowhere.Dial"], "world._target_=nowhere.Dial cannot be"),
-        (["world=own", "world._target_=own_dial.DialWorld", "+world.x=1"], "cannot be made with"),
+        (["world=own", "world._target_=own_dial.DialWorld", "+world.x=1"], "cannot be made: "),
         (["world=own"], "world._target_"),
         (["+world.judged=perhaps"], "unknown world.judged 'perhaps'"),
-        (["world._target_=own_dial.DialWorld"], "cannot be made with"),
+        (["world._target_=own_dial.DialWorld"], "cannot be made: "),
         (["world=gymnasium"], "one of world.id=... and world.factory=..."),
         (["world=gymnasium", "world.factory=own_dial.Nothing"], "cannot be imported"),
         (["world.size=2"], "size must be 3..16"),

@@ -80,7 +80,8 @@ def test_what_there_is_no_place_for_is_skipped_where_that_is_wanted():
     """As of missions of an evaluation that no demonstration showed."""
     words = Vocabulary(["go", "left"], length=2)
     given = ["now go left left", "walk on"]
-    assert words.encode(given, skip_unknown=True).tolist() == [[1, 2], [0, 0]]
+    with pytest.warns(UserWarning, match="no demonstration says 'walk': it is left out"):
+        assert words.encode(given, skip_unknown=True).tolist() == [[1, 2], [0, 0]]
     with pytest.raises(UserError, match="0 words"):
         words.encode("...", skip_unknown=True)
     with pytest.raises(UserError, match="unknown skip_unknown 'no': choose one of True, False"):

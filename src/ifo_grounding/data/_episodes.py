@@ -58,6 +58,11 @@ class Reader:
                     "and instruction"
                 )
             name, frames, sentence, *cut = episode
+            if not isinstance(name, str | int | np.integer):
+                raise UserError(
+                    f"episode {number} is named by {_kind(name)}: give name, frames and "
+                    "instruction in this order"
+                )
             self.sentences.append(self._sentence(name, sentence))
             waiting.append(self._frames(name, frames, self.close and not any(cut)))
             self.lengths.append(len(waiting[-1]))

@@ -107,6 +107,8 @@ class Demonstrations:
         Raises:
             UserError: with the number of the episode that is not as it has to be.
         """
+        if isinstance(instructions, str):
+            raise UserError("instructions are a sentence for each episode, got one text")
         if not isinstance(instructions, Tensor):
             pairs: Iterable[Any] = enumerate(zip_longest(frames, instructions))
             named = ((number, *pair) for number, pair in pairs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import unicodedata
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -80,7 +81,8 @@ class Vocabulary:
 
         Args:
             skip_unknown: whether to leave out what the vocabulary has no place for: unknown words,
-                of which a sentence may consist, and those beyond its length.
+                with a warning for each, of which a sentence may consist, and those beyond its
+                length.
 
         Raises:
             UserError: where a word is unknown, or a sentence is empty or too long.
@@ -91,9 +93,12 @@ class Vocabulary:
         tokens = torch.full((len(sentences), self.length), PAD, dtype=torch.int64)
         for row, sentence in enumerate(sentences):
             words = words_of(sentence, self.punctuation)
+            unknown = [word for word in words if word not in self._ids]
             if skip_unknown and words:
+                for word in unknown:
+                    warnings.warn(f"no demonstration says {word!r}: it is left out", stacklevel=2)
                 words = [word for word in words if word in self._ids][: self.length]
-            elif unknown := [word for word in words if word not in self._ids]:
+            elif unknown:
                 raise UserError(
                     f"unknown word {unknown[0]!r} in {sentence!r}: the vocabulary holds "
                     + ", ".join(self.words)

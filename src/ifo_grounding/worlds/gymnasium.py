@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
-from hydra.utils import get_method
 
 from ifo_grounding.envs import GymnasiumEnv, from_gymnasium
 from ifo_grounding.envs.reading import numbered_actions
@@ -19,7 +19,8 @@ from ifo_grounding.worlds.base import World
 class Gymnasium(World):
     """A world of Gymnasium with images, sentences and discrete actions.
 
-    Its instruction is in the observation or in ``info``; an episode has succeeded if its last step
+    Its instruction is in the observation or in ``info``; words of it that no demonstration says are
+    left out, with a warning. An episode has succeeded if its last step
     pays a reward above 0. The arguments are those of :func:`~ifo_grounding.envs.from_gymnasium`.
     """
 
@@ -36,8 +37,6 @@ class Gymnasium(World):
     stop: int | str | None = None
     """Number of the action by which a policy says that it is done, ``add`` for one more action that
     never reaches the world, or null without any."""
-    skip_unknown: bool = True
-    """Whether words that no demonstration says are left out of instructions."""
     names: list[str] | None = None
     """Names of the actions; numbers by default."""
 
@@ -63,9 +62,14 @@ class Gymnasium(World):
         if self.factory is None:
             return lambda: gymnasium.make(str(self.id), **self.make)
         try:
-            factory = get_method(self.factory)
+            factory = pkgutil.resolve_name(self.factory)
         except Exception as error:  # whatever the module raises as it is imported
-            raise UserError(f"world.factory={self.factory} cannot be imported: {error}") from None
+            raise UserError(
+                f"world.factory={self.factory} cannot be imported: {error}; is the folder of its "
+                "module in PYTHONPATH?"
+            ) from None
+        if not callable(factory):
+            raise UserError(f"world.factory={self.factory} is no function or class")
         return lambda: factory(**self.make)
 
     def _worlds(self, num_envs: int, **options: Any) -> GymnasiumEnv:
@@ -78,6 +82,6 @@ class Gymnasium(World):
             image=self.image,
             instruction=self.instruction,
             stop=self.stop,
-            skip_unknown=self.skip_unknown,
+            skip_unknown=True,  # no demonstration taught them
             **options,
         )
