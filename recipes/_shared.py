@@ -124,7 +124,7 @@ def open_stage(options: Options, name: str) -> Stage:
 def world_of(options: Options) -> World:
     """Return the world, with the words of the run's demonstrations where it has none of its own."""
     spec = dict(options.world)
-    judged = spec.pop("judged", None)
+    rewarded = spec.pop("rewarded", None)
     try:
         world: World = instantiate(spec, _convert_="all")
     except Exception as error:  # of an own class, whatever it raises
@@ -134,9 +134,9 @@ def world_of(options: Options) -> World:
         raise UserError(f"world._target_={spec.get('_target_')} cannot be made: {cause}") from None
     if not isinstance(world, World):
         raise UserError(f"world._target_={spec['_target_']} is no ifo_grounding.worlds.World")
-    if judged is not None:
-        check_choice("world.judged", judged, (True, False))
-        world.judged = judged
+    if rewarded is not None:
+        check_choice("world.rewarded", rewarded, (True, False))
+        world.rewarded = rewarded
     recorded = Run(options.run) / DEMONSTRATIONS
     if world.vocabulary is None and recorded.exists():
         world.vocabulary = Demonstrations.load(recorded).vocabulary

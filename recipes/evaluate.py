@@ -91,7 +91,7 @@ def evaluation_scenes(options: Options) -> dict[str, Any]:
 def played(options: Options, episodes: int, **chosen: Any) -> tuple[Any, dict[str, Any]]:
     """Return the instructed world of the evaluation scenes, and how to play it."""
     scenes, world = {**evaluation_scenes(options), **chosen}, world_of(options)
-    if not world.judged:
+    if not world.rewarded:
         raise UserError(
             f"nobody knows success in this world: ifo-grounding play run={options.run} shows it"
         )

@@ -73,7 +73,9 @@ def examine(options: Options) -> dict:
         checkpoint=stage.checkpoint,
         checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
-        callback=audit_callback(policy, reward, run, options) if world_of(options).judged else None,
+        callback=audit_callback(policy, reward, run, options)
+        if world_of(options).rewarded
+        else None,
         progress=options.progress,
         workers=remote_simulators(run, options),
     )

@@ -31,7 +31,7 @@ from report import report
 
 def two_phase(options: Options) -> dict:
     last = STAGES.index(options.until or STAGES[-1])
-    judged = world_of(options).judged  # a world that cannot be made is refused before all else
+    rewarded = world_of(options).rewarded  # what cannot be made is refused before all else
     print(
         f"{one_line(options.task)}, {options.demonstrations.n:,} demonstrations: about "
         f"{math.ceil(expected_minutes(options))} min of a core; what is interrupted goes on",
@@ -43,7 +43,7 @@ def two_phase(options: Options) -> dict:
         if name == "record_demonstrations" and (reason := phase_1_alone(options)):
             print(f"phase 1 alone: {reason}", flush=True)
             last = min(last, STAGES.index("imitate"))
-    if last < STAGES.index("imitate") or not judged:
+    if last < STAGES.index("imitate") or not rewarded:
         return {}
     if options.controls.run and last == len(STAGES) - 1:
         continue_imitation(options)
@@ -110,7 +110,7 @@ def stages_of(options: Options) -> dict[str, Callable[[Options], dict]]:
 def main(options: Options) -> dict:
     results = two_phase(options)
     if not results:
-        if not world_of(options).judged:
+        if not world_of(options).rewarded:
             print(f"nobody knows success in this world: ifo-grounding play run={options.run}")
         return results
     page = report(options, results)

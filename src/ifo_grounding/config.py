@@ -13,13 +13,17 @@ from typing import Any
 from omegaconf import MISSING
 
 from ifo_grounding.baselines.config import METHODS, BaselineConfig
+from ifo_grounding.episodes import MODES
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range, whole
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks.config import NetworksConfig
+from ifo_grounding.objectives.instruction import UNLABELLED
 from ifo_grounding.seeding import STREAMS
+from ifo_grounding.tasks.grammar import SPLITS
 from ifo_grounding.training.run import LOGGERS
 from ifo_grounding.training.self_examination import SelfExaminationConfig
 from ifo_grounding.training.supervised import FitConfig
+from ifo_grounding.transforms.choosing import CHOICES
 
 STAGES = (
     "record_demonstrations",
@@ -130,8 +134,8 @@ class InstructionConfig(FitConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("choose", self.choose, ("random", "best"))
-        check_choice("unlabelled", self.unlabelled, ("removal", "mixture"))
+        check_choice("choose", self.choose, CHOICES)
+        check_choice("unlabelled", self.unlabelled, UNLABELLED)
         check_range(self, "candidates", "negatives", "trials", "trial_steps", least=1)
         check_range(self, "contrast", "fresh_states", least=0)
         check_range(self, "removal_warmup", least=0, most=1)
@@ -212,9 +216,9 @@ class EvaluateConfig:
     """Most actions of an episode; null leaves it to the world."""
 
     def __post_init__(self) -> None:
-        check_choice("mode", self.mode, ("greedy", "sampled", "both"))
+        check_choice("mode", self.mode, (*MODES, "both"))
         check_choice("stream", self.stream, STREAMS)
-        check_choice("split", self.split, ("all", "train", "zero-shot"))
+        check_choice("split", self.split, SPLITS)
         check_range(self, "episodes", "audit_episodes", "max_steps", least=1)
         check_range(self, "states", "seed", least=0)
 

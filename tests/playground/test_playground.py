@@ -156,7 +156,7 @@ def test_worlds_of_gymnasium_are_played_and_taught_in():
 def test_a_lesson_is_trained_in_the_world_in_which_it_was_shown(agent):
     rooms = {"_target_": "ifo_grounding.worlds.BabyAI", "level": "GoToObj", "processes": None}
     options = options_of(*taught_in(rooms))
-    assert options.world == {**rooms, "judged": False} and options.task == "taught"
+    assert options.world == {**rooms, "rewarded": False} and options.task == "taught"
     agents = {"own": agent, "rooms": replace(agent, teach=taught_in(rooms))}
     visit = Visit(Source(agents.get, ("own", "rooms")))
     visit.choose("rooms")

@@ -125,7 +125,7 @@ def test_what_nobody_judges_is_trained_and_then_played(options, tmp_path, monkey
         (["world=own", "world._target_=nowhere.Dial"], "world._target_=nowhere.Dial cannot be"),
         (["world=own", "world._target_=own_dial.DialWorld", "+world.x=1"], "cannot be made: "),
         (["world=own"], "world._target_"),
-        (["+world.judged=perhaps"], "unknown world.judged 'perhaps'"),
+        (["+world.rewarded=perhaps"], "unknown world.rewarded 'perhaps'"),
         (["world._target_=own_dial.DialWorld"], "cannot be made: "),
         (["world=gymnasium"], "one of world.id=... and world.factory=..."),
         (["world=gymnasium", "world.factory=own_dial.Nothing"], "cannot be imported"),

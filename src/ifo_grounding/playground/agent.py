@@ -51,9 +51,9 @@ def taught_in(world: Mapping[str, Any]) -> tuple[str, ...]:
         world: its options, with its class as ``_target_``.
 
     >>> taught_in({"_target_": "own.Dial", "marks": None})[1:4]
-    ('world._target_=own.Dial', '+world.marks=null', '+world.judged=False')
+    ('world._target_=own.Dial', '+world.marks=null', '+world.rewarded=False')
     """
-    world = {**world, "judged": False}  # nobody else knows what the person means
+    world = {**world, "rewarded": False}  # nobody else knows what the person means
     given = [
         f"{'' if name == '_target_' else '+'}world.{name}={'null' if value is None else value}"
         for name, value in world.items()
@@ -220,12 +220,12 @@ class Agent:
     ) -> Played:
         how: dict[str, Any] = {"seed": seed, "stream": STREAM, "state": state}
         how["max_steps"] = MOST_STEPS
-        if sentence is None and not self.world.judged:
+        if sentence is None and not self.world.rewarded:
             sentence = self.sentences[0]
         tokens = None if sentence is None else self.read(sentence)
-        judged = self.world.judged and (tokens is None or self._judges(tokens))
+        rewarded = self.world.rewarded and (tokens is None or self._judges(tokens))
         with TURNS:
-            if judged:
+            if rewarded:
                 (episode,) = record_episodes(policy, self._env, [scene], sentence=sentence, **how)
             else:  # it is said to the policy alone
                 assert tokens is not None
@@ -245,7 +245,7 @@ class Agent:
                 words = tokens.expand(len(frames) - 1, -1)
                 seen = TensorDict({keys.PIXELS: frames[:-1], keys.INSTRUCTION: words}, [len(words)])
                 values = self.value(seen)[keys.STATE_VALUE].flatten().tolist()
-        return Played(trace, states, values, fulfilled, episode.success if judged else None)
+        return Played(trace, states, values, fulfilled, episode.success if rewarded else None)
 
     def _judges(self, tokens: Tensor) -> bool:
         """Whether the world knows what fulfils a sentence of a person's own."""

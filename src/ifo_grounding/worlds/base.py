@@ -47,8 +47,8 @@ class World(ABC):
         vocabulary: the words of instructions; None until the demonstrations tell them, which
             recipes then set.
         oracle: what knows the truth; None where nobody does.
-        judged: whether instructed worlds pay success. Without, nothing is evaluated: a person looks
-            at what was learned (``ifo-grounding play``).
+        rewarded: whether instructed worlds pay success. Without, nothing is evaluated: a person
+            looks at what was learned (``ifo-grounding play``).
         tiles: what the numbers that :meth:`coded` shows stand for, uint8 [K, C, T, T], which
             networks then read (:func:`ifo_grounding.networks.read_codes`); None for pixels.
     """
@@ -57,7 +57,7 @@ class World(ABC):
     stop_action: int | None = None
     vocabulary: Vocabulary | None = None
     oracle: Oracle | None = None
-    judged: bool = True
+    rewarded: bool = True
     tiles: Tensor | None = None
 
     @abstractmethod

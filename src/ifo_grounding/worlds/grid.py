@@ -142,7 +142,7 @@ class Grid(Tiled):
 class OpenGrid(Tiled):
     """The same grid with sentences of a person's own, of which nobody knows what fulfils them."""
 
-    judged = False
+    rewarded = False
 
     def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
         """Return worlds without instructions; see :class:`World`."""
