@@ -67,8 +67,9 @@ def test_frames_of_a_gpu_become_demonstrations():
         assert torch.equal(made[which].lengths, made.lengths[[2, 0]])
 
 
+@pytest.mark.parametrize("preset", ["paper", "strong"])
 @pytest.mark.parametrize("kind", ["instruction", "goal"])
-def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
+def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind, preset):
     """There neither distinct instructions nor final frames are looked for."""
     demos = data.record_demonstrations("move", 40, seed=0)
     pool = demos.pool()[:2]  # of two, the other one is drawn
@@ -77,12 +78,11 @@ def test_the_losses_of_pairs_are_the_same_on_a_gpu(kind):
     def losses(device):
         options = {"seed": 0, "device": device}
         if kind == "goal":
-            loss = GoalLoss(
-                networks.make_goal_classifier(demos, "paper", **options), pool, negatives=1
-            )
+            network = networks.make_goal_classifier(demos, preset, **options)
+            loss = GoalLoss(network, pool, negatives=1)
             batch = data.goal_buffer(demos)[:]
         else:
-            network = networks.make_instruction_classifier(demos, "paper", **options)
+            network = networks.make_instruction_classifier(demos, preset, **options)
             loss = InstructionLoss(network, pool, unlabelled="mixture", near=0.5)
             batch = data.first_frame_buffer(demos)[:]
         out = loss.to(device).eval()(batch.to(device))
@@ -171,6 +171,18 @@ def test_a_gpu_is_asked_once_whether_the_weights_of_a_classifier_changed():
             assert "equal" not in asking.noted
             next(classifier.parameters()).data[0] += 1
             assert scorer.words(torch.device("cuda", 0)) is not before
+
+
+@pytest.mark.parametrize("preset", ["paper", "strong"])
+def test_a_step_of_the_instruction_classifier_asks_a_gpu_nothing(preset):
+    demos = data.record_demonstrations("pick", 20, seed=0)
+    batch = data.first_frame_buffer(demos)[:]
+    with pretended_gpu():
+        network = networks.make_instruction_classifier(demos, preset, seed=0, device="cuda")
+        loss = InstructionLoss(network, demos.pool(), removal_rate=0.0).to("cuda")
+        with Asking() as asking:
+            total_loss(loss(batch.to("cuda"))).backward()
+    assert not asking.noted & WAITS
 
 
 @pytest.mark.parametrize("codes", [False, True])

@@ -105,11 +105,14 @@ class WordScorer(PairScorer):
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
         """Map token ids [*B, L] to how much each word counts, and the modifier: [*B, D]."""
-        tokens, which = distinct_rows(rows_of_ids(instruction))
+        tokens, which = rows_of_ids(instruction), None
+        if not tokens.is_cuda:  # which would have to be waited for
+            tokens, which = distinct_rows(tokens)
         tokens = without_padding(tokens, self.known)
         with torch.autocast(tokens.device.type, enabled=False):
             spoken, modifier = self.words.listen(tokens)
-            words = look_up(torch.cat([spoken.flatten(1), modifier], -1), which)
+            words = torch.cat([spoken.flatten(1), modifier], -1)
+            words = words if which is None else look_up(words, which)
         return words.reshape(*instruction.shape[:-1], words.shape[-1])
 
     def _read(self, scenes: Kinds, words: Tensor, index: Tensor) -> Tensor:

@@ -177,19 +177,16 @@ def pair_scores(
 
     Each row's images and each distinct instruction are encoded once, and each distinct pair is
     scored once where scenes repeat. On a GPU, where finding the distinct ones would wait for it,
-    all are encoded unless scenes are shared.
+    all are.
     """
     *pixel_keys, instruction_key = network.in_keys
     images = [batch.get(key) for key in pixel_keys]
     both = torch.cat([batch.get(instruction_key).unsqueeze(1), others], 1)
     halves, tokens, shape = halves_of(network, output), both.flatten(0, 1).long(), both.shape[:2]
     if tokens.is_cuda:
-        scenes = halves.encode_scenes(*images)
-        which = torch.arange(len(tokens), device=tokens.device)
-        if not isinstance(scenes, Tensor | TensorDictBase):
-            tokens, which = distinct_rows(tokens)
+        which = torch.arange(len(tokens), device=tokens.device).view(shape)
         words = halves.encode_instruction(tokens)
-        scores = halves.score_candidates(scenes, words, which.view(shape)).reshape(shape)
+        scores = halves.score_candidates(halves.encode_scenes(*images), words, which).reshape(shape)
         return scores[:, 0], scores[:, 1:]
     tokens, which = distinct_rows(tokens)
     words, which = halves.encode_instruction(tokens), which.view(shape)
