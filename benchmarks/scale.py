@@ -35,7 +35,7 @@ from ifo_grounding.transforms import GoalReward, InstructionSampler
 from ifo_grounding.worlds import BabyAI
 
 OUT = ROOT / "results" / "bench" / "scale.json"
-WORLDS, STEPS = 64, 20
+WORLDS, STEPS, BATCH = 64, 20, 4096
 PIECE = ("budget=tiny", "until=imitate", "evaluate.episodes=100", "evaluate.states=0")
 PIECE += ("progress=false", "logger=none")
 NETWORK = 1e9 / 8
@@ -138,11 +138,14 @@ def model() -> Row:
 
 
 def imitation() -> Row:
-    """Imitation by two processes that share each batch, by one, and by two with a batch each."""
+    """Imitation by two processes that share each batch, by one, and by two that learn apart.
 
-    def learn(count: int) -> tuple[float, float]:
+    The latter have a batch of half the size each, so that only waiting for each other is left out.
+    """
+
+    def learn(count: int, size: int = BATCH) -> tuple[float, float]:
         command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
-        command += [f"--nproc-per-node={count}", __file__, "--imitate"]
+        command += [f"--nproc-per-node={count}", __file__, "--imitate", str(size)]
         threads = {**os.environ, "OMP_NUM_THREADS": "1"}
         ended = subprocess.run(command, env=threads, check=True, text=True, stdout=-1)
         samples, taken = json.loads(ended.stdout.splitlines()[-1])
@@ -150,25 +153,25 @@ def imitation() -> Row:
 
     def learn_apart() -> tuple[float, float]:
         with ThreadPoolExecutor(2) as pool:
-            samples, taken = zip(*pool.map(learn, (1, 1)), strict=True)
+            samples, taken = zip(*pool.map(learn, (1, 1), (BATCH // 2,) * 2), strict=True)
         return sum(samples), max(taken)
 
     contenders = {
         "2 processes": lambda: learn(2),
         "1 process": lambda: learn(1),
-        "2 processes, each alone": learn_apart,
+        "2 processes that learn apart": learn_apart,
     }
     return Row("imitation, preset strong", "samples/s", contenders, {"1 process": 1.7})
 
 
-def imitate() -> None:
+def imitate(size: int) -> None:
     """Imitate in this process, one of those of torchrun; the first tells samples and seconds."""
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.distributed.init_process_group("gloo")
     demos, truth = record_demonstrations("move", 2000, seed=0, keep_truth=True)
     loss = ImitationLoss(networks.make_policy(demos, "strong", seed=0))
-    config = FitConfig(steps=120, batch_size=1024, iteration=20)
+    config = FitConfig(steps=60, batch_size=size, iteration=20)
     history = fit(loss, labelled_buffer(demos, truth.actions), config, seed=0)[1:]
     samples = config.iteration * config.batch_size
     taken = sum(samples / row["samples_per_second"] for row in history)
@@ -217,4 +220,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    imitate() if "--imitate" in sys.argv else main()
+    imitate(int(sys.argv[2])) if "--imitate" in sys.argv else main()
