@@ -59,6 +59,17 @@ def test_a_sentence_that_no_template_makes_is_followed_and_not_judged(agent):
         agent.play(7, 0, 400 * "x")
 
 
+def test_who_came_longest_ago_is_forgotten(monkeypatch):
+    page = importlib.import_module("ifo_grounding.playground.page")
+    monkeypatch.setattr(page, "MOST_STUDIES", 2)
+    studies = {}
+    first = page.recalled(studies, "a")
+    page.recalled(studies, "b")
+    assert page.recalled(studies, "a") is first
+    page.recalled(studies, "c")
+    assert list(studies) == ["a", "c"]
+
+
 @pytest.mark.parametrize("channels", [1, 3, 4, 6])
 def test_frames_of_any_world_are_drawn(channels):
     assert picture(np.zeros((8, 8, channels), np.uint8)).startswith("data:image/png")

@@ -13,6 +13,8 @@ from ifo_grounding.playground.visit import Source, Study, Visit
 
 gradio: Any = optional("gradio", extra="play")
 LOCAL = "127.0.0.1"
+MOST_STUDIES = 256
+"""People whose lessons are kept in memory."""
 
 
 def open_page(source: Source, host: str = LOCAL, port: int = 7860, browser: bool = True) -> None:
@@ -57,6 +59,14 @@ def theme() -> Any:
     )
 
 
+def recalled(studies: dict[str, Study], known: str) -> Study:
+    """Return what a person showed before; who came longest ago is forgotten."""
+    study = studies[known] = studies.pop(known, None) or Study()
+    if len(studies) > MOST_STUDIES:
+        del studies[next(iter(studies))]
+    return study
+
+
 def build_page(source: Source) -> Any:
     """Return the page as ``gradio.Blocks``, which also runs in a notebook or in a Space."""
     studies: dict[str, Study] = {}
@@ -67,7 +77,7 @@ def build_page(source: Source) -> Any:
         def begin(known: str) -> tuple[str, Visit]:
             """Return a fresh tab of a browser, which finds what it taught before."""
             known = known if known in studies else secrets.token_urlsafe()
-            return known, Visit(source, studies.setdefault(known, Study()))
+            return known, Visit(source, recalled(studies, known))
 
         entered = page.load(begin, token, [token, visit], show_progress="hidden")
         with gradio.Tab("Watch and talk"):
