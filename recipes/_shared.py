@@ -38,13 +38,14 @@ CLASSIFIER = "instruction.safetensors"
 REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
 VALUE = "value.safetensors"
+PAIRS = "pairs"
 CHECKSUMS = "networks.json"
 """Of the networks that the run has trained, by file."""
 OF_PHASE_2 = (
     *("self_examine", "continue_imitation", "evaluate"),
-    *(POLICIES["phase2"], CONTINUED, VALUE),
+    *(POLICIES["phase2"], CONTINUED, VALUE, PAIRS),
 )
-"""Stages and networks that a run makes anew where it takes over another's phase 1."""
+"""Stages and files that a run makes anew where it takes over another's phase 1."""
 CHOSEN_ANEW = (
     *("self_examine", "controls", "preset", "budget"),
     *("instruction.threshold", "instruction.candidates", "instruction.choose"),

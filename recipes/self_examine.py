@@ -8,10 +8,12 @@ import torch
 from _shared import (
     CLASSIFIER,
     GOAL,
+    PAIRS,
     POLICIES,
     REWARD,
     VALUE,
     build,
+    checksums,
     chosen_by,
     coded_simulator,
     finish,
@@ -26,12 +28,14 @@ from _shared import (
 )
 from evaluate import audit_callback
 from imitate import labelled_demonstrations
+from tensordict import TensorDict
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
 from ifo_grounding.data import labelled_buffer
+from ifo_grounding.data.folder import load_folder, save_folder
 from ifo_grounding.networks import make_value
 from ifo_grounding.objectives import ImitationLoss, RewardLoss
 from ifo_grounding.training import (
@@ -43,6 +47,9 @@ from ifo_grounding.training import (
     self_examine,
 )
 from ifo_grounding.transforms import GoalReward, InstructionSampler, LearnedReward, StartingPairs
+
+KIND, PARTS = "ifo-grounding pairs", ("scene", "instruction", "frame_hash")
+"""The folder of pairs and what it holds."""
 
 
 def examine(options: Options) -> dict:
@@ -113,22 +120,29 @@ def learned_reward(run: Run, options: Options) -> LearnedReward | GoalReward:
 
 
 def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPairs:
-    """Return fresh states with chosen instructions, or the paper's fixed number of pairs."""
+    """Return fresh states with chosen instructions, or the paper's fixed number of pairs.
+
+    Pairs are kept in the run, for where the search is long: some tasks suit one state in seventy.
+    """
     classifier = load_network(run, CLASSIFIER, "train_instruction", options)
     pool, section = load_demonstrations(run).pool(), options.self_examine
     if section.pairs is None:
         return InstructionSampler(classifier, pool, **chosen_by(options))
-    with torch.no_grad():
-        pairs = select_pairs(
-            coded_simulator(options, section.num_envs),
-            classifier,
-            pool,
-            section.pairs,
-            seed=options.seed,
-            progress=options.progress,
-            **chosen_by(options),
-        )
-    return StartingPairs(pairs)
+    made_by = {"classifier": checksums(run).get(CLASSIFIER)}
+    if not (run / PAIRS).exists() or load_folder(run / PAIRS, KIND, PARTS)[1] != made_by:
+        with torch.no_grad():
+            pairs = select_pairs(
+                coded_simulator(options, section.num_envs),
+                classifier,
+                pool,
+                section.pairs,
+                seed=options.seed,
+                progress=options.progress,
+                **chosen_by(options),
+            )
+        save_folder(run / PAIRS, KIND, dict(pairs.items()), made_by)
+    parts, _ = load_folder(run / PAIRS, KIND, PARTS)
+    return StartingPairs(TensorDict(parts, [section.pairs]).clone())
 
 
 def adversarial_updates(reward: Any, run: Run, options: Options) -> AdversarialUpdates | None:

@@ -10,9 +10,10 @@ from ifo_grounding import networks
 from ifo_grounding.config import STAGES
 from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.errors import UserError
-from ifo_grounding.files import read_json
+from ifo_grounding.files import read_json, write_json
 from ifo_grounding.mosaic import as_words, assemble
 from ifo_grounding.report import results_rows, text_table
+from ifo_grounding.training import Run
 from pretended_gpu import pretended_gpu
 from recipes.conftest import make_stages
 
@@ -79,6 +80,22 @@ def test_both_phases_of_paper_run_through_with_their_control(options, tmp_path):
     assert results["action_reward"] and results["changes"]
     audit = read_json(tmp_path / "run" / "metrics" / "self_examine.json")
     assert "held_out_accuracy" in audit[-1]
+
+
+def test_pairs_are_searched_once_for_one_classifier(options, monkeypatch, tmp_path):
+    import self_examine
+
+    given, run = options("self_examine.pairs=24"), Run(tmp_path / "run")
+    make_stages(given, until="train_instruction")
+    first = self_examine.chosen_starts(run, given)
+    monkeypatch.setattr(self_examine, "select_pairs", lambda *_, **__: 1 / 0)
+    again = self_examine.chosen_starts(run, given)
+    assert len(first.scenes) == 24 and torch.equal(again.scenes, first.scenes)
+    assert torch.equal(again.tokens, first.tokens)
+    other = {**read_json(run / "networks.json"), "instruction.safetensors": None}
+    write_json(run / "networks.json", other)
+    with pytest.raises(ZeroDivisionError):
+        self_examine.chosen_starts(run, given)
 
 
 @pytest.mark.parametrize("preset", ["strong", pytest.param("paper", marks=pytest.mark.slow)])

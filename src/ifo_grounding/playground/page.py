@@ -61,7 +61,8 @@ def theme() -> Any:
 
 def recalled(studies: dict[str, Study], known: str) -> Study:
     """Return what a person showed before; who came longest ago is forgotten."""
-    study = studies[known] = studies.pop(known, None) or Study()
+    study = studies.pop(known) if known in studies else Study()
+    studies[known] = study
     if len(studies) > MOST_STUDIES:
         del studies[next(iter(studies))]
     return study
