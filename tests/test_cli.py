@@ -1,5 +1,6 @@
 """The command line, and what makes a function a recipe: mistakes get one line and exit code 2."""
 
+import importlib
 import os
 import re
 import runpy
@@ -75,6 +76,7 @@ def run(*arguments: str) -> int:
 
 
 def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
+    importlib.import_module("ifo_grounding.options")  # Ray and others set variables as they load
     before = (list(sys.argv), list(sys.path), Path.cwd(), dict(os.environ))
     assert run("run", "greet", "task=pick", "imitate.lr=1", "preset=paper") == 0
     assert capsys.readouterr().out == "hello pick 1.0 0\n"
@@ -137,7 +139,7 @@ def test_help_of_a_recipe_lists_its_options(recipes, capsys):
     assert run("run", "greet", "--help") == 0
     printed = capsys.readouterr().out
     assert printed.startswith("greet: options are written name=value")
-    assert "\n  preset: paper, strong\n" in printed
+    assert re.search(r"\n  budget=tiny +some seconds for every stage, to try", printed)
     assert "\n  seed=0 " in printed and "Of all randomness." in printed
     assert run("run", "greet", "task=pick", "--help") == 0
     assert "\n  task=pick " in capsys.readouterr().out

@@ -265,8 +265,11 @@ def help_text(script: Path, options: Any) -> str:
     """Return the options that a recipe reads, with their values and meanings, by section."""
     lines = [f"{script.stem}: options are written name=value, in a section section.name=value.", ""]
     for group in ("preset", "budget", "world") if isinstance(options, Options) else ():
-        files = (recipes_folder() / "conf" / group).glob("*.yaml")
-        lines.append(f"  {group}: {', '.join(sorted(path.stem for path in files))}")
+        for path in sorted((recipes_folder() / "conf" / group).glob("*.yaml")):
+            said = " ".join(
+                re.findall(r"^# (.*)", path.read_text(), re.M)
+            )  # a command: its meaning
+            lines += _row(f"{group}={path.stem}", said.partition(": ")[2])
     values, some = plain(options), isinstance(options, Options) and script.stem != "two_phase"
     if some:
         text = script.read_text()
@@ -302,10 +305,8 @@ def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[s
 
 def _row(text: str, meaning: str) -> Iterator[str]:
     """Write an option beside what it means."""
-    lines = textwrap.wrap(meaning, 62) or [""]
-    fits = len(text) <= 36
-    yield f"  {text:<36}  {lines[0]}".rstrip() if fits else f"  {text}"
-    yield from (f"{'':<40}{more}" for more in lines[fits:])
+    lead, under = f"  {text:<36}  ", " " * 40
+    yield from textwrap.wrap(meaning, 102, initial_indent=lead, subsequent_indent=under) or [lead]
 
 
 def field_docs(kind: type) -> dict[str, str]:
