@@ -1,6 +1,5 @@
 """The command line, and what makes a function a recipe: mistakes get one line and exit code 2."""
 
-import importlib
 import os
 import re
 import runpy
@@ -11,8 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-import torchrl  # noqa: F401  (sets variables of the environment when it is first imported)
 
+import ifo_grounding.options  # noqa: F401  (its packages set variables as they are first imported)
 from ifo_grounding import cli
 from ifo_grounding.cli import recipe_names, recipes_folder
 from ifo_grounding.errors import UserError
@@ -76,7 +75,6 @@ def run(*arguments: str) -> int:
 
 
 def test_a_recipe_gets_its_options_and_leaves_nothing_behind(recipes, capsys):
-    importlib.import_module("ifo_grounding.options")  # Ray and others set variables as they load
     before = (list(sys.argv), list(sys.path), Path.cwd(), dict(os.environ))
     assert run("run", "greet", "task=pick", "imitate.lr=1", "preset=paper") == 0
     assert capsys.readouterr().out == "hello pick 1.0 0\n"
