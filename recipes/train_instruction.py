@@ -24,6 +24,7 @@ from ifo_grounding.data import Demonstrations, first_frame_buffer
 from ifo_grounding.keys import PIXELS
 from ifo_grounding.networks import make_instruction_classifier
 from ifo_grounding.objectives import InstructionLoss
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.training import Run, Trial, trial_seed
 
 STATES_AT_ONCE = 256
@@ -74,7 +75,7 @@ def clearly_best(trials: list[Trial], steps: int) -> Trial:
     *likely, last = trials
     if not likely:
         return last
-    tried = {trial: trial.learn(steps) for trial in likely}
+    tried = {trial: trial.learn(steps) for trial in progress_bar(likely, desc="trials")}
     best = min(tried, key=lambda trial: tried[trial])
     return last if last.learn(steps) < CLEARLY * tried[best] else best
 

@@ -10,6 +10,7 @@ from typing import Any
 from torchrl.data import ReplayBuffer
 
 from ifo_grounding.objectives import SupervisedLoss
+from ifo_grounding.progress import progress_bar
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.loop import Log, Metrics
 from ifo_grounding.training.supervised import FitConfig, fit
@@ -71,6 +72,7 @@ def successive_halving(trials: Sequence[Trial], steps: int, halvings: int = 0) -
     for times in range(1, halvings + 2):
         if len(trials) == 1:
             break
-        losses = {trial: trial.learn(times * steps) for trial in trials}
+        shown = progress_bar(trials, desc="trials")
+        losses = {trial: trial.learn(times * steps) for trial in shown}
         trials = sorted(losses, key=lambda trial: losses[trial])[: math.ceil(len(losses) / 2)]
     return trials[0]
