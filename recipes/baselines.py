@@ -62,7 +62,7 @@ from ifo_grounding.report.results import by_scene
 from ifo_grounding.training import Run, Stage, fit, improve_policy
 
 ENTROPY = 0.01
-"""Weight of the entropy bonus of a policy that begins from nothing."""
+"""Weight of the entropy bonus of a policy that learns from a discriminator."""
 ROWS = 32
 """Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {

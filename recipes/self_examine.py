@@ -36,6 +36,7 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
 from ifo_grounding.data import labelled_buffer
 from ifo_grounding.data.folder import load_folder, save_folder
+from ifo_grounding.keys import INSTRUCTION, SCENE
 from ifo_grounding.networks import make_value
 from ifo_grounding.objectives import ImitationLoss, RewardLoss
 from ifo_grounding.training import (
@@ -47,9 +48,10 @@ from ifo_grounding.training import (
     self_examine,
 )
 from ifo_grounding.transforms import GoalReward, InstructionSampler, LearnedReward, StartingPairs
+from ifo_grounding.transforms.starts import FRAME_HASH
 
-KIND, PARTS = "ifo-grounding pairs", ("scene", "instruction", "frame_hash")
-"""The folder of pairs and what it holds."""
+KIND = "ifo-grounding pairs"
+"""What the folder of pairs says that it holds."""
 
 
 def examine(options: Options) -> dict:
@@ -68,6 +70,9 @@ def examine(options: Options) -> dict:
     read_fast(seen, options)
     weight = section.imitation_weight
     imitation = AuxiliaryImitation(ImitationLoss(policy), seen, weight) if weight else None
+    # What is measured on the way, for the log alone, where the world pays success.
+    rewarded = world_of(options).rewarded
+    audit = audit_callback(policy, reward, run, options) if rewarded else None
     history = self_examine(
         env,
         policy,
@@ -80,9 +85,7 @@ def examine(options: Options) -> dict:
         checkpoint=stage.checkpoint,
         checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
-        callback=audit_callback(policy, reward, run, options)
-        if world_of(options).rewarded
-        else None,
+        callback=audit,
         progress=options.progress,
         workers=remote_simulators(run, options),
     )
@@ -129,20 +132,22 @@ def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPa
     if section.pairs is None:
         return InstructionSampler(classifier, pool, **chosen_by(options))
     made_by = {"classifier": checksums(run).get(CLASSIFIER)}
-    if not (run / PAIRS).exists() or load_folder(run / PAIRS, KIND, PARTS)[1] != made_by:
-        with torch.no_grad():
-            pairs = select_pairs(
-                coded_simulator(options, section.num_envs),
-                classifier,
-                pool,
-                section.pairs,
-                seed=options.seed,
-                progress=options.progress,
-                **chosen_by(options),
-            )
-        save_folder(run / PAIRS, KIND, dict(pairs.items()), made_by)
-    parts, _ = load_folder(run / PAIRS, KIND, PARTS)
-    return StartingPairs(TensorDict(parts, [section.pairs]).clone())
+    if (run / PAIRS).exists():
+        parts, found = load_folder(run / PAIRS, KIND, (SCENE, INSTRUCTION, FRAME_HASH))
+        if found == made_by:
+            return StartingPairs(TensorDict(parts, [section.pairs]).clone())
+    with torch.no_grad():
+        pairs = select_pairs(
+            coded_simulator(options, section.num_envs),
+            classifier,
+            pool,
+            section.pairs,
+            seed=options.seed,
+            progress=options.progress,
+            **chosen_by(options),
+        )
+    save_folder(run / PAIRS, KIND, dict(pairs.items()), made_by)
+    return StartingPairs(pairs)
 
 
 def adversarial_updates(reward: Any, run: Run, options: Options) -> AdversarialUpdates | None:

@@ -266,9 +266,7 @@ def help_text(script: Path, options: Any) -> str:
     lines = [f"{script.stem}: options are written name=value, in a section section.name=value.", ""]
     for group in ("preset", "budget", "world") if isinstance(options, Options) else ():
         for path in sorted((recipes_folder() / "conf" / group).glob("*.yaml")):
-            said = " ".join(
-                re.findall(r"^# (.*)", path.read_text(), re.M)
-            )  # a command: its meaning
+            said = " ".join(re.findall(r"^# (.*)", path.read_text(), re.M))  # command: meaning
             lines += _row(f"{group}={path.stem}", said.partition(": ")[2])
     values, some = plain(options), isinstance(options, Options) and script.stem != "two_phase"
     if some:
@@ -306,7 +304,8 @@ def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[s
 def _row(text: str, meaning: str) -> Iterator[str]:
     """Write an option beside what it means."""
     lead, under = f"  {text:<36}  ", " " * 40
-    yield from textwrap.wrap(meaning, 102, initial_indent=lead, subsequent_indent=under) or [lead]
+    lines = textwrap.wrap(meaning, 102, initial_indent=lead, subsequent_indent=under)
+    yield from lines or [lead.rstrip()]
 
 
 def field_docs(kind: type) -> dict[str, str]:

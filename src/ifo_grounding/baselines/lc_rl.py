@@ -17,10 +17,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.baselines.access import (
-    SteppableActionDemonstrations,
-    check_access,
-)
+from ifo_grounding.baselines.access import SteppableActionDemonstrations, check_access
 from ifo_grounding.envs.base import begin
 from ifo_grounding.episodes import play
 from ifo_grounding.errors import UserError

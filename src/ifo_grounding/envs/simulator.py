@@ -14,13 +14,7 @@ from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one, check_below, check_choice
 from ifo_grounding.tasks.goals import fulfilled, plan
 from ifo_grounding.tasks.grammar import grammar
-from ifo_grounding.tasks.scenes import (
-    FEWEST,
-    Scene,
-    SceneOptions,
-    draw_scenes,
-    leaves,
-)
+from ifo_grounding.tasks.scenes import FEWEST, Scene, SceneOptions, draw_scenes, leaves
 from ifo_grounding.world import N_BOXES, N_KINDS, Canvas, render, step
 from ifo_grounding.world.tiles import TILE_SIZES
 

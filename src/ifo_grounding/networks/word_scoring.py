@@ -105,15 +105,19 @@ class WordScorer(PairScorer):
 
     def encode_instruction(self, instruction: Tensor) -> Tensor:
         """Map token ids [*B, L] to how much each word counts, and the modifier: [*B, D]."""
-        tokens, which = rows_of_ids(instruction), None
-        if not tokens.is_cuda:  # which would have to be waited for
-            tokens, which = distinct_rows(tokens)
-        tokens = without_padding(tokens, self.known)
-        with torch.autocast(tokens.device.type, enabled=False):
-            spoken, modifier = self.words.listen(tokens)
-            words = torch.cat([spoken.flatten(1), modifier], -1)
-            words = words if which is None else look_up(words, which)
+        rows = rows_of_ids(instruction)
+        with torch.autocast(rows.device.type, enabled=False):
+            if rows.is_cuda:  # which would have to be waited for
+                words = self._heard(rows)
+            else:
+                distinct, which = distinct_rows(rows)
+                words = look_up(self._heard(distinct), which)
         return words.reshape(*instruction.shape[:-1], words.shape[-1])
+
+    def _heard(self, tokens: Tensor) -> Tensor:
+        """Encode every row of ids [N, L]: [N, D]."""
+        spoken, modifier = self.words.listen(without_padding(tokens, self.known))
+        return torch.cat([spoken.flatten(1), modifier], -1)
 
     def _read(self, scenes: Kinds, words: Tensor, index: Tensor) -> Tensor:
         # Cells are the second dimension throughout: on a CPU a softmax over a last dimension of a

@@ -20,8 +20,8 @@ class Gymnasium(World):
     """A world of Gymnasium with images, sentences and discrete actions.
 
     Its instruction is in the observation or in ``info``; words of it that no demonstration says are
-    left out, with a warning. An episode has succeeded if its last step
-    pays a reward above 0. The arguments are those of :func:`~ifo_grounding.envs.from_gymnasium`.
+    left out, with a warning. An episode has succeeded if its last step pays a reward above 0. The
+    arguments are those of :func:`~ifo_grounding.envs.from_gymnasium`.
     """
 
     id: str | None = None
