@@ -85,16 +85,17 @@ def of_scale() -> str:
         for against, ratio in row["ratios"].items():
             (ours,) = row["rates"].keys() - row["ratios"].keys()
             line = {"what": f"{row['name']}: {ours}", "times as fast as": against}
-            lines.append({**line, "measured": between(ratio), "asked": row["reach"][against]})
+            lines.append(
+                {**line, "measured": between(ratio), "asked": row["reach"].get(against, "–")}
+            )
     limit, model = found["growth"]["limit"], []
     for row in found["growth"]["rows"][::2]:
         line = {"workers": f"{row['workers']}", "frames/s": short(row["frames/s"])}
         model.append({**line, "if learning took no time": short(row["bound"])})
     text = (
-        "A model of BabyAI practice, 64 worlds a worker, 1 Gbit/s, from one process's times. "
-        "Workers wait while the learner receives and learns: beyond "
-        f"{limit['frames/s']:.1f} workers it is the bottleneck, beyond {limit['bound']:.0f} if "
-        "learning took no time."
+        "A model of BabyAI practice, 64 worlds a worker, 1 Gbit/s, from one process's times: "
+        f"beyond {limit['frames/s']:.1f} workers the learner is the bottleneck, beyond "
+        f"{limit['bound']:.0f} if learning took no time."
     )
     return "\n\n".join([markdown_table(lines), text, markdown_table(model)])
 
