@@ -192,7 +192,7 @@ def of_methods(
 
 def of_level(options: ReproduceOptions, seed: int, n: int, level: str) -> Piece:
     """Return the piece of one level of BabyAI."""
-    of_run = {"world": "babyai", "level": level, "seed": seed, "demonstrations.n": n}
+    of_run = {"world": "babyai", "task": level, "seed": seed, "demonstrations.n": n}
     name = f"{level}-{n}-{options.level['preset']}-seed{seed}"
     return piece(options, f"levels-{name}", f"babyai/{name}.json", of_run, options.level)
 

@@ -113,7 +113,7 @@ def test_several_values_run_one_after_the_other(recipes, capsys):
 def test_results_of_several_seeds_end_in_one_table(recipes, capsys):
     assert run("run", "greet", "-m", "task=measure", "seed=4,6", "preset=strong,paper") == 0
     *_, strong, paper = capsys.readouterr().out.splitlines()
-    assert strong.split()[:3] == ["measure-strong-demo-seed*", "2", "70.0%"]
+    assert strong.split()[:3] == ["measure-strong-few-seed*", "2", "70.0%"]
     assert paper.split()[:3] == ["measure-paper-many-seed*", "2", "70.0%"]
     assert run("run", "greet", "-m", "task=measure", "seed=4,6", "run='n4-n6-${seed}'") == 0
     assert capsys.readouterr().out.splitlines()[-1].split()[:2] == ["n4-n6-*", "2"]

@@ -115,7 +115,8 @@ def test_few_demonstrations_take_a_budget_of_their_own_unless_one_is_named(tmp_p
         options = options_of(*said)
         return options.budget, options.demonstrations.n, options.imitate.batch_size
 
-    assert imitate()[:2] == ("demo", 50)
+    assert imitate()[:2] == imitate("task=move")[:2] == ("demo", 50)
+    assert imitate("task=pick")[:2] == ("few", 200)
     assert imitate("world=babyai")[:2] == imitate("preset=paper")[:2] == ("many", 3000)
     assert imitate("demonstrations.n=999") == ("few", 999, 64)
     assert imitate("demonstrations.n=1000") == ("many", 1000, 256)
@@ -169,7 +170,7 @@ def test_every_option_is_read():
 
 
 def test_tiny_records_and_plays_little_on_every_level():
-    tiny = options_of("world=babyai", "level=BossLevel", "budget=tiny")
+    tiny = options_of("world=babyai", "task=BossLevel", "budget=tiny")
     assert tiny.demonstrations.n <= 16  # its bot takes half a minute for these
     assert tiny.evaluate.max_steps * tiny.evaluate.episodes <= 1000
 

@@ -242,14 +242,13 @@ class Options:
     """All options; each recipe reads those that concern it."""
 
     task: str = MISSING
-    """``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``; of other worlds, a name."""
-    level: str | None = None
-    """Level of BabyAI, with ``world=babyai``."""
+    """``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``; with ``world=babyai`` a
+    level; of other worlds, a name."""
     preset: str = MISSING
     """Networks and how they learn: ``strong`` (the best that we know) or ``paper``."""
     budget: str = MISSING
     """How much data and how many steps: ``tiny``, ``few`` or ``many`` by the number of
-    demonstrations, ``full`` (the paper's 80,000), or ``demo``, where nothing is named."""
+    demonstrations, ``full`` (the paper's 80,000), or ``demo``, the main job."""
     seed: int = 0
     """Of all randomness."""
     device: str = "cpu"

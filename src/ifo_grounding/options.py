@@ -161,7 +161,8 @@ def _settled(overrides: Sequence[str]) -> Options:
     counted = not {"demonstrations.n", "recorded", "world"}.isdisjoint(named)
     free = named.get("preset", "strong") == "strong" and "budget" not in named
     n, few = named.get("demonstrations.n"), ["budget=few"]
-    known = few if isinstance(n, int) and n < FEW else [] if counted else ["budget=demo"]
+    main_job = ["budget=demo"] if named.get("task", "move") == "move" else few  # harder tasks
+    known = few if isinstance(n, int) and n < FEW else [] if counted else main_job
     words += [f"~hydra/{group}" for group in UNREAD if "hydra" not in " ".join(named)]
     cfg = compose(CONFIG, words + known * free)
     trees: Any = plain(Options()), OmegaConf.to_container(cfg)

@@ -76,6 +76,7 @@ def test_every_piece_is_a_call_that_demo_takes(reproduce_options, asked):
         assert options.run == piece.call.run
         assert options.demonstrations.n == 80_000 or "levels" in asked
         assert (options.base is None) == (piece.base is None)
+        assert "levels" not in asked or options.world["level"] == "GoToObj"
 
 
 @pytest.mark.parametrize(

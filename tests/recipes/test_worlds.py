@@ -132,7 +132,7 @@ def test_what_nobody_judges_is_trained_and_then_played(options, tmp_path, monkey
         (["world.size=2"], "size must be 3..16"),
         (["world.objects=[1]"], "objects must be .fewest, most. within 0..36"),
         (["task=mov"], "unknown task 'mov'"),
-        (["world=babyai", "level=GoToMoon"], "unknown level 'GoToMoon'"),
+        (["world=babyai", "task=GoToMoon"], "unknown level 'GoToMoon'"),
     ],
 )
 def test_a_world_that_cannot_be_is_refused_first(options, dial, tmp_path, said, refused):
@@ -155,7 +155,7 @@ def test_both_phases_run_in_babyai(options, tmp_path):
     from two_phase import two_phase
 
     given = options(
-        *("world=babyai", "level=GoToObj", "world.processes=1", "references=true"),
+        *("world=babyai", "task=GoToObj", "world.processes=1", "references=true"),
         *("imitate.lr=1e-4", "self_examine.iterations=1", "controls.run=true"),
         f"results={tmp_path / 'results'}",
     )
