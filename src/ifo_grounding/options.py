@@ -24,11 +24,8 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from ifo_grounding.cli import recipes_folder
 from ifo_grounding.config import PASSING, Options
-from ifo_grounding.data import Demonstrations
-from ifo_grounding.data.lerobot import INFO
-from ifo_grounding.data.pictures import LIST, read_list
+from ifo_grounding.data.recorded import count_recorded
 from ifo_grounding.errors import UserError, did_you_mean
-from ifo_grounding.files import read_json
 from ifo_grounding.training.checkpoint import leaves, written
 from ifo_grounding.training.run import Run
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
@@ -179,15 +176,7 @@ def _settled(overrides: Sequence[str]) -> Options:
 def _demonstrations(cfg: DictConfig) -> int:
     """Return how many demonstrations are asked for: no more than were recorded elsewhere."""
     asked = int(cfg.demonstrations.n)
-    if not cfg.recorded:
-        return asked
-    folder = Path(cfg.recorded)
-    if not folder.is_dir():
-        raise UserError(f"recorded={folder} is no folder of demonstrations")
-    if (folder / INFO).exists():
-        return min(asked, read_json(folder / INFO, dict, ["total_episodes"])["total_episodes"])
-    recorded = read_list(folder) if (folder / LIST).exists() else Demonstrations.load(folder)
-    return min(asked, len(recorded))
+    return min(asked, count_recorded(Path(cfg.recorded))) if cfg.recorded else asked
 
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Iterable[str]) -> DictConfig:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from ifo_grounding.data import Demonstrations
+from ifo_grounding.data.recorded import load_recorded
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.files import home
 from ifo_grounding.playground import drawing
@@ -20,7 +21,6 @@ from ifo_grounding.playground.agent import Agent, Played, Suited
 from ifo_grounding.playground.looking import Recorded, look
 from ifo_grounding.playground.teaching import Lesson, Training
 from ifo_grounding.world import BOX_COLOURS, N_KINDS, WorldState, kind_name
-from ifo_grounding.worlds import World
 
 LOOK, ARM, CLEAR = "nothing", "the arm", "take away"
 OBJECTS = [kind_name(number) for number in range(1, N_KINDS + 1)]
@@ -216,9 +216,9 @@ class Visit:
         path = Path(folder).expanduser()
         if not self.source.local and not path.resolve().is_relative_to(home().resolve()):
             raise UserError(f"this page is shared: it reads folders in {home()} alone")
-        if not folder.strip() or not path.is_dir():
-            raise UserError(f"{folder!r} is no folder of demonstrations")
-        demos = World.recorded(path)
+        if not folder.strip():
+            raise UserError("name a folder of demonstrations")
+        demos = load_recorded(path)
         inverse, actions = self.agent.inverse, self.agent.world.actions
         if inverse is not None and tuple(inverse.network_config.shapes.image_shape) != (
             demos.image_shape

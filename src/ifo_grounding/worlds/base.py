@@ -11,9 +11,8 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
-from ifo_grounding.data import Demonstrations, Truth, load_lerobot, load_pictures
-from ifo_grounding.data.lerobot import INFO
-from ifo_grounding.data.pictures import LIST
+from ifo_grounding.data import Demonstrations, Truth
+from ifo_grounding.data.recorded import load_recorded
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import Endings, SuitabilityResult
 from ifo_grounding.tasks import Vocabulary
@@ -124,25 +123,13 @@ class World(ABC):
         """
         raise UserError(f"{type(self).__name__} has no demonstrator to compare with")
 
-    @staticmethod
-    def recorded(folder: Path, **options: Any) -> Demonstrations:
-        """Read a folder of pictures or of LeRobot, or what ``Demonstrations.save`` wrote."""
-        if (folder / LIST).exists():
-            return load_pictures(folder, **options)
-        if (folder / INFO).exists():
-            return load_lerobot(folder, **options)
-        return Demonstrations.load(folder)
-
     def read(self, folder: str | Path, progress: bool = False) -> Demonstrations:
         """Read demonstrations that were recorded elsewhere.
 
         Raises:
             UserError: where there are none, or they show other images than the simulator.
         """
-        folder = Path(folder)
-        if not folder.is_dir():
-            raise UserError(f"recorded={folder} is no folder of demonstrations")
-        demos = self.recorded(folder, vocabulary=self.vocabulary, progress=progress)
+        demos = load_recorded(Path(folder), vocabulary=self.vocabulary, progress=progress)
         if not demos.cut.any():
             demos = demos.close_episodes()
         if self.vocabulary is None:
