@@ -64,15 +64,15 @@ def expected_minutes(options: Options) -> float:
     imitate, told, goal = options.imitate, options.instruction, options.goal
     tried = sum(imitate.trials / 2**k for k in range(imitate.trial_halvings + 1))
     steps = imitate.steps + (tried - 1) * imitate.trial_steps
-    seconds = steps * (7e-3 + 4e-5 * imitate.batch_size)
+    seconds = steps * (1.5e-2 + 1.2e-4 * imitate.batch_size)
     fresh = 32 if options.demonstrations.n < told.fresh_states else 0
     scored = (told.steps + (told.trials - 1) * told.trial_steps) * told.batch_size
     seconds += scored * (1 + told.negatives + fresh) * 1e-5
-    seconds += goal.steps * goal.batch_size * 3.6e-4
+    seconds += goal.steps * goal.batch_size * 6e-4
     practised = options.self_examine
-    seconds += practised.iterations * practised.num_envs * practised.steps * 3e-4
+    seconds += practised.iterations * practised.num_envs * practised.steps * 4e-4
     searched = 10 * (practised.pairs or 0) * min(told.candidates, options.demonstrations.n)
-    seconds += searched * 8e-6  # where one state in ten gets a pair
+    seconds += searched * 1.1e-5  # where one state in ten gets a pair
     seconds += options.evaluate.episodes * 8e-3
     return (20 + seconds * (4 if options.preset == "paper" else 1)) / 60
 
