@@ -28,9 +28,8 @@ def runs_of(folder: str, order: Sequence[str]) -> dict[tuple[str, int], Runs]:
 
 
 def studied() -> dict[tuple[str, int], Runs]:
-    """Return the runs of each task and number of demonstrations: the newest with five seeds."""
-    newest = {key: runs for key, runs in runs_of("few", TASKS).items() if len(runs) >= 5}
-    found = runs_of("study", TASKS) | newest
+    """Return the runs of each task and number of demonstrations, the newest where there are two."""
+    found = runs_of("study", TASKS) | runs_of("few", TASKS)
     return dict(sorted(found.items(), key=lambda item: (TASKS.index(item[0][0]), item[0][1])))
 
 
@@ -214,8 +213,8 @@ def tables() -> dict[str, str]:
     rows = study_rows()
     found: dict[str, list[Row]] = {
         "few": [readme_row(row) for key, row in rows.items() if key in few],
-        "results": [row for key, row in rows.items() if key in few],
-        "up-to-2000": [row for key, row in rows.items() if key not in few and key[1] <= 2000],
+        "results": [row for key, row in rows.items() if key[1] <= 200],
+        "up-to-2000": [row for key, row in rows.items() if 200 < key[1] <= 2000],
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
         "baselines": baseline_rows(),

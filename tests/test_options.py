@@ -34,6 +34,7 @@ def sections():
         ("imitate.steps=1.5", "option imitate.steps: value '1.5'"),
         ("imitate=3", "option imitate: "),
         ("world.nope=1", "unknown option 'world.nope'"),
+        ("world.factory=a.b", r"unknown option 'world\.factory' \(it is one of world=gymnasium\)"),
         ("preset=huge", "unknown preset 'huge': choose one of paper, strong"),
         ("world=moon", "unknown world 'moon': choose one of babyai, grid, gymnasium, own"),
         ("preset=null", "name=value"),

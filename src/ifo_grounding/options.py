@@ -56,7 +56,8 @@ def texts_of(kind: Any) -> dict[str, str]:
 TEXTS = texts_of(Options)
 STORE = ConfigStore.instance()
 STORE.store(name="options", node=Options)
-for world in (Grid, BabyAI, Gymnasium):
+WORLDS: dict[str, Any] = {"grid": Grid, "babyai": BabyAI, "gymnasium": Gymnasium}
+for world in WORLDS.values():
     node = OmegaConf.structured(world)
     with open_dict(node):
         node["_target_"] = f"ifo_grounding.worlds.{world.__name__}"
@@ -237,11 +238,14 @@ def explained(error: Exception) -> UserError:
         hint = did_you_mean(given, allowed)
         return UserError(f"unknown {group} {given!r}{hint}: choose one of {', '.join(allowed)}")
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)) and cause.full_key:
-        section, dot, _ = cause.full_key.rpartition(".")
+        section, dot, option = cause.full_key.rpartition(".")
         parent = cause.parent_node
         names = sorted({*map(str, parent or ())} - {"hydra"})
         where = f"{section!r} has" if section else "there are"
         hint = did_you_mean(cause.full_key, [f"{section}{dot}{name}" for name in names])
+        for world, kind in WORLDS.items() if section == "world" else ():
+            if option in {field.name for field in dataclasses.fields(kind)}:
+                hint = f" (it is one of world={world})"
         return UserError(f"unknown option {cause.full_key!r}{hint}: {where} {', '.join(names)}")
     said = re.sub(r"^\w+Exception: ", "", str(cause).splitlines()[0])
     if said.startswith("Ambiguous"):
