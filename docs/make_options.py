@@ -14,6 +14,8 @@ from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
 SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
 WORLDS = {"world=grid": Grid, "world=babyai": BabyAI, "world=gymnasium": Gymnasium}
+UNMADE = "run=/nowhere"
+"""A run of the default name may be there, made with other options."""
 FITTED = [name for name, kind in SECTIONS.items() if issubclass(kind, FitConfig)]
 
 
@@ -24,7 +26,7 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
 
 def described() -> str:
     """Return every option with its value and meaning, as Markdown."""
-    composed = (options_of(f"preset={name}") for name in ("strong", "paper"))
+    composed = (options_of(f"preset={name}", UNMADE) for name in ("strong", "paper"))
     presets = [replace(each, run=Options.run) for each in composed]
     values = {name: [getattr(each, name) for each in presets] for name in SECTIONS}
     general, learning = field_docs(Options), field_docs(FitConfig)
@@ -37,7 +39,7 @@ def described() -> str:
     parts = ["## General\n", listed(general, "", presets)]
     parts += [f"## How networks learn\n\n{said}\n", f"{markdown_table(rows)}\n"]
     for name, kind in {**SECTIONS, **WORLDS}.items():
-        of = values.get(name) or [SimpleNamespace(**options_of(name).world)]
+        of = values.get(name) or [SimpleNamespace(**options_of(name, UNMADE).world)]
         own = {n: m for n, m in field_docs(kind).items() if name not in FITTED or n not in learning}
         if own:
             said = (inspect.getdoc(kind) or "").partition("\n\n")[0].replace("``", "`")
