@@ -6,14 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 from ifo_grounding.config import Options
-from ifo_grounding.options import field_docs, options_of
+from ifo_grounding.options import WORLDS, field_docs, options_of
 from ifo_grounding.report import markdown_table
 from ifo_grounding.training import FitConfig
 from ifo_grounding.training.checkpoint import written
-from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
 SECTIONS = {f.name: f.default_factory for f in fields(Options) if is_dataclass(f.default_factory)}
-WORLDS = {"world=grid": Grid, "world=babyai": BabyAI, "world=gymnasium": Gymnasium}
 UNMADE = "run=/nowhere"
 """A run of the default name may be there, made with other options."""
 FITTED = [name for name, kind in SECTIONS.items() if issubclass(kind, FitConfig)]
@@ -38,7 +36,8 @@ def described() -> str:
     said = f"Each in {', '.join(f'`{name}`' for name in FITTED)}, such as `imitate.lr`."
     parts = ["## General\n", listed(general, "", presets)]
     parts += [f"## How networks learn\n\n{said}\n", f"{markdown_table(rows)}\n"]
-    for name, kind in {**SECTIONS, **WORLDS}.items():
+    worlds = {f"world={name}": kind for name, kind in WORLDS.items()}
+    for name, kind in {**SECTIONS, **worlds}.items():
         of = values.get(name) or [SimpleNamespace(**options_of(name, UNMADE).world)]
         own = {n: m for n, m in field_docs(kind).items() if name not in FITTED or n not in learning}
         if own:

@@ -52,7 +52,7 @@ def test_stops_are_added_where_none_is_shown(options, recipes, tmp_path, demos, 
     ("said", "refused"),
     [
         (["world.tile_size=16"], r"are \[3, 48, 48\], those of the simulator \[3, 96, 96\]"),
-        (["recorded=nowhere"], "'nowhere' is no folder"),
+        (["recorded=nowhere"], "recorded=nowhere is no folder"),
         (["recorded=."], r"no episodes\.jsonl, as a folder of pictures .* no meta\.json"),
         (["task=pick"], r"is of another task: .* is no sentence of pick; .*say task="),
     ],

@@ -36,7 +36,7 @@ def count_recorded(folder: Path) -> int:
 def _form(folder: Path) -> str:
     """Return the file that tells a folder's form."""
     if not folder.is_dir():
-        raise UserError(f"{str(folder)!r} is no folder of demonstrations")
+        raise UserError(f"recorded={folder} is no folder of demonstrations")
     for name in (LIST, INFO, META):
         if (folder / name).exists():
             return name

@@ -216,8 +216,8 @@ class Visit:
         path = Path(folder).expanduser()
         if not self.source.local and not path.resolve().is_relative_to(home().resolve()):
             raise UserError(f"this page is shared: it reads folders in {home()} alone")
-        if not folder.strip():
-            raise UserError("name a folder of demonstrations")
+        if not folder.strip() or not path.is_dir():
+            raise UserError(f"{folder!r} is no folder of demonstrations")
         demos = load_recorded(path)
         inverse, actions = self.agent.inverse, self.agent.world.actions
         if inverse is not None and tuple(inverse.network_config.shapes.image_shape) != (
