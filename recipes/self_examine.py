@@ -88,6 +88,7 @@ def examine(options: Options) -> dict:
         callback=audit,
         progress=options.progress,
         workers=remote_simulators(run, options),
+        cudagraph=True,
     )
     save_network(run, VALUE, value)
     save_network(run, POLICIES["phase2"], policy)

@@ -15,7 +15,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_map_only
 
-from ifo_grounding.training import supervised
+from ifo_grounding.training import updates
 
 GPU = torch.device("cuda", 0)
 ACROSS = {"copy_", "__set__"}
@@ -50,8 +50,8 @@ def pretended_gpu() -> Iterator[None]:
         return
     with pytest.MonkeyPatch.context() as patch, _Mode():
         patch.setattr(torch, "Generator", Generator)
-        patch.setattr(supervised, "CapturedUpdate", lambda update: update)
-        patch.setattr(supervised, "let_capture", lambda optimizer, captured: None)
+        patch.setattr(updates, "CapturedUpdate", _Graph)
+        patch.setattr(updates, "let_capture", lambda optimizer, captured: None)
         patch.setattr(torch, "save", _saving(torch.save))
         patch.setattr(torch.nn.Module, "_apply", _swapping(torch.nn.Module._apply))
         fork = torch.random.fork_rng
@@ -68,6 +68,19 @@ def pretended_gpu() -> Iterator[None]:
         }.items():
             patch.setattr(torch.cuda, name, lambda *_, value=value, **__: value)
         yield
+
+
+class _Graph:
+    """An update of which only batches like the first one can be made."""
+
+    def __init__(self, update: Callable) -> None:
+        self.update, self.first = update, None
+
+    def __call__(self, batch: Any) -> Any:
+        shapes = {key: each.shape for key, each in batch.items(True, True)}
+        self.first = self.first or shapes
+        assert shapes == self.first, "a CUDA graph takes batches of the same shapes"
+        return self.update(batch)
 
 
 class _Mode(TorchFunctionMode):

@@ -10,6 +10,8 @@ from torchrl.envs import Compose, TransformedEnv
 from ifo_grounding import data, networks
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.objectives import GoalLoss, ImitationLoss, InstructionLoss, InverseLoss
+from ifo_grounding.training import AuxiliaryImitation, SelfExaminationConfig
+from ifo_grounding.training.policy_gradient import Learner
 from ifo_grounding.training.updates import total_loss
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 from ifo_grounding.transforms.choosing import PoolScorer
@@ -156,6 +158,39 @@ def test_a_step_of_imitation_asks_a_gpu_nothing(preset, codes):
             total_loss(loss(batch.to("cuda"))).backward()
     assert "mm" in asking.noted or "addmm" in asking.noted
     assert not asking.noted & WAITS
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reinforce"])
+@pytest.mark.parametrize("preset", ["paper", "strong"])
+def test_a_step_of_practice_asks_a_gpu_nothing(preset, algorithm):
+    demos, truth = data.record_demonstrations("move", 20, seed=0, keep_truth=True)
+    buffer = data.labelled_buffer(demos, truth.actions)
+    with pretended_gpu():
+        buffer.transform.to("cuda")
+        env = PickAndPlaceEnv("move", num_envs=8, seed=0, device="cuda")
+        reward = LearnedReward(networks.make_reward_model(env, preset, seed=0, device="cuda"))
+        policy = networks.make_policy(env, preset, seed=0, device="cuda").eval()
+        value = networks.make_value(env, preset, seed=0, device="cuda", init_from=policy).eval()
+        imitation = AuxiliaryImitation(ImitationLoss(policy), buffer, weight=0.1, batch_size=16)
+        config = SelfExaminationConfig(algorithm, steps=4, minibatch=20, value_warmup=0, epochs=1)
+        learner, asked = Learner(policy, value, config, imitation), []
+        learner.prepare(captured=True)
+        captured = learner.captured
+
+        def watched(batch):
+            with Asking() as asking:
+                metrics = captured(batch)
+            asked.append(asking.noted)
+            return metrics
+
+        learner.captured = watched
+        before = [weight.clone() for weight in policy.parameters()]
+        with torch.no_grad():
+            batch = TransformedEnv(env, reward).rollout(4, policy, break_when_any_done=False)
+        metrics = learner.improve(batch, iteration=0)  # 32 steps: the last 12 are no graph
+        moved = [not torch.equal(*pair) for pair in zip(before, policy.parameters(), strict=True)]
+    assert len(asked) == 1 and "_fused_adamw_" in asked[0] and not asked[0] & WAITS
+    assert all(moved) and metrics["loss_imitation"] > 0
 
 
 def test_a_gpu_is_asked_once_whether_the_weights_of_a_classifier_changed():

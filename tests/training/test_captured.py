@@ -2,12 +2,26 @@
 
 import pytest
 import torch
+from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding.data import labelled_buffer, record_demonstrations
-from ifo_grounding.networks import make_instruction_classifier, make_policy, make_reward_model
+from ifo_grounding.envs import PickAndPlaceEnv
+from ifo_grounding.networks import (
+    make_instruction_classifier,
+    make_policy,
+    make_reward_model,
+    make_value,
+)
 from ifo_grounding.objectives import ImitationLoss, InstructionLoss, RewardLoss
-from ifo_grounding.training import FitConfig, fit
-from ifo_grounding.training.updates import let_capture, make_optimizer, set_rate
+from ifo_grounding.training import (
+    AuxiliaryImitation,
+    FitConfig,
+    SelfExaminationConfig,
+    fit,
+    self_examine,
+)
+from ifo_grounding.training.updates import let_capture, make_optimizer, set_rates
+from ifo_grounding.transforms import InstructionSampler, LearnedReward
 
 
 def test_an_optimizer_is_captured_or_not_whatever_a_checkpoint_says():
@@ -15,14 +29,14 @@ def test_an_optimizer_is_captured_or_not_whatever_a_checkpoint_says():
     optimizer = make_optimizer([weight], 0.1)
     let_capture(optimizer, True)
     rate = optimizer.param_groups[0]["lr"]
-    set_rate(optimizer, 0.25)
+    set_rates(optimizer, 0.25)
     assert rate.item() == 0.25
     saved = optimizer.state_dict()
     other = make_optimizer([weight], 0.1)
     other.load_state_dict(saved)
     let_capture(other, False)
     assert (other.param_groups[0]["lr"], other.param_groups[0]["capturable"]) == (0.25, False)
-    set_rate(other, 0.5)
+    set_rates(other, 0.5)
     assert other.param_groups[0]["lr"] == 0.5
     weight.grad = torch.ones(2)
     other.step()
@@ -59,4 +73,29 @@ def test_a_captured_step_learns_what_single_kernels_learn(make, kind, tolerance,
             history = fit(loss, buffer, config, seed=0, until=until, **how)
         found[cudagraph] = torch.tensor([list(row.values())[1] for row in history])
     assert (found[True] - found[False]).abs().max() < tolerance, found
+    assert found[True][-1] < found[True][0]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("algorithm", ["ppo", "reinforce"])
+def test_captured_practice_learns_what_single_kernels_learn(algorithm):
+    demos, truth = record_demonstrations("move", 200, seed=0, keep_truth=True)
+    buffer = labelled_buffer(demos, truth.actions)
+    buffer.transform.to("cuda")
+    simulator = PickAndPlaceEnv("move", 16, seed=0, device="cuda", instructed=False)
+    options = {"seed": 0, "device": "cuda"}
+    classifier = make_instruction_classifier(simulator, **options)
+    reward = make_reward_model(simulator, **options)
+    config = SelfExaminationConfig(algorithm, iterations=8, steps=8, minibatch=50, value_warmup=1)
+    found = {}
+    for cudagraph in (False, True):
+        sampler = InstructionSampler(classifier, demos.pool(), threshold=0.0)
+        env = TransformedEnv(simulator, Compose(sampler, LearnedReward(reward)))
+        policy = make_policy(simulator, dropout=0.0, **options)
+        value = make_value(simulator, init_from=policy, **options)
+        imitation = AuxiliaryImitation(ImitationLoss(policy), buffer, 1.0, 64)
+        how = {"imitation": imitation, "cudagraph": cudagraph}
+        history = self_examine(env, policy, value, config, seed=0, **how)
+        found[cudagraph] = torch.tensor([row["loss_imitation"] for row in history])
+    assert (found[True] - found[False]).abs().max() < 0.1, found
     assert found[True][-1] < found[True][0]

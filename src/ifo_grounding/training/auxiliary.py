@@ -38,9 +38,12 @@ class AuxiliaryImitation:
         check_range(self, "weight", above=0)
         check_range(self, "batch_size", least=1)
 
-    def __call__(self) -> Tensor:
-        """Return the weighted loss of a batch of demonstrations, a scalar."""
-        batch = beside(self.buffer.sample(self.batch_size), self.loss)
+    def sample(self) -> TensorDictBase:
+        """Return a batch of demonstrated steps, where the policy is."""
+        return beside(self.buffer.sample(self.batch_size), self.loss)
+
+    def __call__(self, batch: TensorDictBase) -> Tensor:
+        """Return the weighted loss of a batch of demonstrated steps, a scalar."""
         return self.weight * self.loss(batch)["loss_imitation"]
 
 

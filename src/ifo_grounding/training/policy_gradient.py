@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torch.distributions import Categorical
 from torchrl.objectives import ClipPPOLoss, LossModule, ReinforceLoss
 from torchrl.objectives.value import GAE
 
@@ -14,13 +16,22 @@ from ifo_grounding import keys
 from ifo_grounding.modules import output_key
 from ifo_grounding.training.auxiliary import AuxiliaryImitation
 from ifo_grounding.training.loop import Metrics
-from ifo_grounding.training.updates import make_optimizer, means, update
+from ifo_grounding.training.updates import make_optimizer, means, prepared, set_rates, update
 
 if TYPE_CHECKING:
     from ifo_grounding.training.self_examination import SelfExaminationConfig
 
 AT_ONCE = 2048
 """Steps whose values are estimated together, to bound memory."""
+
+
+class PPOLoss(ClipPPOLoss):
+    """TorchRL's loss, which waits for the GPU to see whether entropies of logits are finite."""
+
+    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Any:
+        if isinstance(dist, Categorical):
+            return dist.entropy().unsqueeze(-1)
+        return super()._get_entropy(dist, adv_shape)
 
 
 class Learner:
@@ -43,7 +54,7 @@ class Learner:
         )
         self.loss: LossModule
         if config.algorithm == "ppo":
-            self.loss = ClipPPOLoss(
+            self.loss = PPOLoss(
                 policy,
                 value,
                 clip_epsilon=config.clip,
@@ -61,6 +72,17 @@ class Learner:
         self.optimizer = make_optimizer(actor, config.lr)
         self.optimizer.add_param_group({"params": list(value.parameters())})
 
+    def prepare(self, captured: bool) -> None:
+        """Make updates as CUDA graphs or kernel by kernel, with the optimizer as it now is."""
+        self.captured = prepared(self.update, self.optimizer, captured)
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Make one gradient step on collected and, beside them, demonstrated steps."""
+        losses = self.loss(batch["collected"])
+        if self.imitation:
+            losses["loss_imitation"] = self.imitation(batch["demonstrated"])
+        return update(losses, self.optimizer, self.config.grad_clip)
+
     def improve(self, batch: TensorDictBase, iteration: int) -> Metrics:
         """Update policy and value on collected steps."""
         config = self.config
@@ -68,16 +90,17 @@ class Learner:
             self.advantage(batch)
         scale = 1 - iteration / config.iterations if config.anneal else 1.0
         trained = iteration >= config.value_warmup
-        self.optimizer.param_groups[0]["lr"] = scale * config.lr if trained else 0.0
-        self.optimizer.param_groups[1]["lr"] = scale * config.value_lr
+        policy_lr = scale * config.lr if trained else 0.0
+        set_rates(self.optimizer, policy_lr, scale * config.value_lr)
         # What comes next is in the advantage already; copying its images would cost a tenth.
         steps = batch.exclude(keys.NEXT, keys.INITIAL_PIXELS).reshape(-1)
         epochs = config.epochs if config.algorithm == "ppo" else 1
         updates = []
         for _ in range(epochs):
-            for rows in torch.randperm(len(steps)).split(config.minibatch):
-                losses = self.loss(steps[rows])
+            for rows in torch.randperm(len(steps), device=steps.device).split(config.minibatch):
+                parts = TensorDict({"collected": steps[rows]}, device=steps.device)
                 if self.imitation:
-                    losses["loss_imitation"] = self.imitation()
-                updates.append(update(losses, self.optimizer, config.grad_clip))
+                    parts["demonstrated"] = self.imitation.sample()
+                whole = len(rows) == min(config.minibatch, len(steps))
+                updates.append(self.captured(parts) if whole else self.update(parts))
         return means(updates)

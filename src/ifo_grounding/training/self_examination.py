@@ -17,6 +17,7 @@ from ifo_grounding import keys
 from ifo_grounding.attributes import first_worker, untransformed
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.machine import release_freed_memory
+from ifo_grounding.modules import device_of
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
 from ifo_grounding.training.checkpoint import Checkpoint
@@ -135,6 +136,7 @@ def improve_policy(
     callback: Callable[[int], Metrics] | None = None,
     progress: bool = False,
     workers: Sequence[Callable[[], EnvBase]] = (),
+    cudagraph: bool = False,
 ) -> list[Metrics]:
     """Improve ``policy`` in place by policy gradient on learned rewards, wherever it may step.
 
@@ -153,6 +155,8 @@ def improve_policy(
         callback: gets the iteration, returns further metrics; the place for audits.
         workers: where steps are not to be collected in ``env``: each makes, in a process of a Ray
             cluster, an environment like it that has its share of the rows.
+        cudagraph: whether to capture the gradient step as a CUDA graph on a GPU, as of
+            :func:`~ifo_grounding.training.fit`.
 
     Raises:
         UserError: where the env has no instructions or no learned reward, where ``policy`` is no
@@ -191,6 +195,8 @@ def improve_policy(
     settings = {**asdict(config), "seed": seed, "worlds": env.batch_size.numel()}
     saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
     loop = Loop(NAME, config.iterations, saved, checkpoint_seconds, log, progress)
+    on_gpu = getattr(device_of(policy), "type", None) == "cuda"
+    learner.prepare(cudagraph and on_gpu and (imitation is None or imitation.loss.capturable))
     every = config.select_every
     if every and not loop.history:
         best.measure()

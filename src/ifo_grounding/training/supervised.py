@@ -21,13 +21,11 @@ from ifo_grounding.training.loop import Log, Loop, Metrics
 from ifo_grounding.training.parallel import averaged, averaging, processes, samples
 from ifo_grounding.training.selection import BestWeights
 from ifo_grounding.training.updates import (
-    CapturedUpdate,
-    Update,
     decay_towards_origin,
-    let_capture,
     make_optimizer,
     means,
-    set_rate,
+    prepared,
+    set_rates,
     update,
 )
 
@@ -156,13 +154,12 @@ def fit(
     loop = Loop(name, pause_at, saved, checkpoint_seconds, log, progress)
     same_steps = getattr(loss, "capturable", False) and isinstance(sampler, RandomSampler)
     captured = cudagraph and device.type == "cuda" and same_steps and processes() == 1
-    let_capture(optimizer, captured)
     shared = averaging(loss)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
         return update(shared(batch), optimizer, config.grad_clip)
 
-    make_step: Update = CapturedUpdate(step) if captured else step
+    make_step = prepared(step, optimizer, captured)
     for iteration in loop:
         first = iteration * config.iteration
         steps = range(first, min(first + config.iteration, config.steps))
@@ -172,7 +169,7 @@ def fit(
         for number, batch in zip(steps, drawn, strict=True):
             if callable(set_progress := getattr(loss, "set_progress", None)):
                 set_progress(number / config.steps)
-            set_rate(optimizer, config.lr * config.rate(number))
+            set_rates(optimizer, config.lr * config.rate(number))
             updates.append(make_step(beside(batch, loss)))
         found = averaged(means(updates), device)  # a GPU is waited for once, not after each step
         speed = len(steps) * config.batch_size / (time.perf_counter() - start)

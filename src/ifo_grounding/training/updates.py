@@ -123,6 +123,12 @@ class CapturedUpdate:
         return metrics
 
 
+def prepared(step: Update, optimizer: torch.optim.Optimizer, captured: bool) -> Update:
+    """Return a step that steps an optimizer, as a CUDA graph or kernel by kernel."""
+    let_capture(optimizer, captured)
+    return CapturedUpdate(step) if captured else step
+
+
 def let_capture(optimizer: torch.optim.Optimizer, captured: bool) -> None:
     """Prepare an optimizer for a CUDA graph, or for none, whatever a checkpoint has set."""
     for group in optimizer.param_groups:
@@ -131,9 +137,9 @@ def let_capture(optimizer: torch.optim.Optimizer, captured: bool) -> None:
         group["capturable"] = captured
 
 
-def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    """Set the learning rate, in place where a graph reads it."""
-    for group in optimizer.param_groups:
+def set_rates(optimizer: torch.optim.Optimizer, *rates: float) -> None:
+    """Set the learning rate of each group, in place where a graph reads it."""
+    for group, rate in zip(optimizer.param_groups, rates, strict=True):
         if isinstance(group["lr"], Tensor):
             group["lr"].fill_(rate)
         else:
