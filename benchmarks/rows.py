@@ -467,13 +467,14 @@ def stream() -> dict[str, float]:
     }
 
 
-def whole() -> Row:
+def whole(task: str, count: int, asked: str) -> Row:
     """Train both phases as `ifo-grounding demo` does, from random steps to the practised policy."""
     with tempfile.TemporaryDirectory() as home:
         recipe = ROOT / "recipes" / "two_phase.py"
-        options = [f"threads={torch.get_num_threads()}", f"device={DEVICE}", "progress=false"]
+        options = [f"task={task}", f"demonstrations.n={count}", "run=whole", "progress=false"]
+        options += [f"threads={torch.get_num_threads()}", f"device={DEVICE}"]
         subprocess.run(
-            [sys.executable, str(recipe), "demonstrations.n=3000", "run=whole", *options],
+            [sys.executable, str(recipe), *options],
             env={**os.environ, "IFO_GROUNDING_HOME": home},
             stdout=subprocess.DEVNULL,
             check=True,
@@ -482,11 +483,11 @@ def whole() -> Row:
     seconds = sum(taken for stage, taken in found["stages"].items() if stage != "evaluate")
     success = {phase: found["results"][phase]["rate"]["rate"] for phase in ("phase1", "phase2")}
     return Row(
-        "both phases on move, from nothing",
+        f"both phases on {task}, from nothing",
         "s",
         {},
-        note="preset strong, 3,000 demonstrations, success of 2,000 evaluation scenes; asked: 99%"
-        " within 180 seconds",
+        note=f"preset strong, {count:,} demonstrations, success of 2,000 evaluation scenes; asked: "
+        + asked,
         facts={
             "seconds, without evaluation": seconds,
             "% success, phase 1": 100 * success["phase1"],
@@ -520,8 +521,13 @@ ROWS: dict[str, Callable[[], Row]] = {
     "recording": recording,
     "memory": memory,
     "streaming": streaming,
-    "whole": whole,
+    "whole": functools.partial(whole, "move", 3000, "99% within 180 seconds"),
+    "whole-udlr": functools.partial(whole, "pick-udlr", 200, "60 seconds"),
 }
+ON_GPU = ("worlds", "worlds-pixels", "collector-strong", "imitation-strong", "whole-udlr")
+"""Rows that are measured on a GPU where none are named: of them speeds there are asked."""
+ON_CPU = tuple(name for name in ROWS if name != "whole-udlr")
+"""Rows that are measured on a CPU where none are named."""
 
 if __name__ == "__main__":
     called, *given = sys.argv[1:]

@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("rows", nargs="*", help="names of rows; all by default")
+    parser.add_argument("rows", nargs="*", help="names of rows; by default those of the device")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument(
         "--threads", type=int, default=2, help="threads of torch, and cores for all"
@@ -88,7 +88,7 @@ def main() -> None:
     sys.path.insert(0, str(HERE))
     import rows
 
-    chosen = options.rows or list(rows.ROWS)
+    chosen = options.rows or (rows.ON_CPU if options.device == "cpu" else rows.ON_GPU)
     if unknown := set(chosen) - set(rows.ROWS):
         sys.exit(f"unknown rows {sorted(unknown)}: choose among {', '.join(rows.ROWS)}")
     made = {**provenance(), "threads": options.threads, "device": options.device}
