@@ -78,7 +78,7 @@ def babyai() -> tuple[BabyAI, Compose, nn.Module, Learner]:
     world = BabyAI("GoToLocal")
     demos, _ = world.demonstrate(64, seed=0)
     world.vocabulary = demos.vocabulary
-    shown = world.simulator(1, seed=0)
+    shown = world.coded(1, seed=0)
     policy, value = (make(shown, seed=0) for make in (networks.make_policy, networks.make_value))
     sampler = InstructionSampler(
         networks.make_instruction_classifier(shown, seed=0), demos.pool(), threshold=0.0
@@ -94,7 +94,7 @@ def practice() -> Row:
     world, rewarded, policy, learner = babyai()
 
     def make(rows: int = WORLDS // 2) -> TransformedEnv:
-        return TransformedEnv(world.simulator(rows, seed=0), rewarded.clone())
+        return TransformedEnv(world.coded(rows, seed=0), rewarded.clone())
 
     here = Here(make(WORLDS), policy, STEPS)
     on_ray = OnRay(make(WORLDS), policy, STEPS, [make] * 2)
@@ -115,7 +115,7 @@ def model() -> Row:
     """What practice in BabyAI costs a processor and sends, for the model of many workers."""
     torch.set_num_threads(1)
     world, rewarded, policy, learner = babyai()
-    env = TransformedEnv(world.simulator(WORLDS, seed=0), rewarded)
+    env = TransformedEnv(world.coded(WORLDS, seed=0), rewarded)
     here, frames = Here(env, policy, STEPS), WORLDS * STEPS
     seconds: dict[str, list[float]] = {"collect": [], "learn": []}
     for number in range(6):

@@ -13,6 +13,7 @@ from ifo_grounding.data.babyai import DONE
 from ifo_grounding.envs import from_gymnasium
 from ifo_grounding.envs.wrapping import world_seed
 from ifo_grounding.errors import UserError
+from ifo_grounding.mosaic import as_words, assemble
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks import Vocabulary
 
@@ -63,6 +64,24 @@ def test_a_picture_is_minigrid_s_own_and_shows_what_is_carried():
     seen, plain = room.step(0)[0]["image"], level.get_frame(highlight=False, tile_size=16)
     assert (seen != plain).any(-1).nonzero()[0].max() < 16
     assert np.array_equal(seen[16:], plain[16:]) and np.array_equal(seen[:, 16:], plain[:, 16:])
+
+
+@pytest.mark.parametrize("level", ["PutNextLocal", "UnlockPickup", "GoToDoor"])
+def test_codes_are_numbers_of_the_tiles_that_a_picture_shows(level):
+    drawn, coded = (babyai(level, codes=codes)() for codes in (False, True))
+    tiles = as_words(coded.tiles)
+    assert len(torch.unique(tiles, dim=0)) == len(tiles)
+    draw, kinds = np.random.default_rng(0), set()
+    for seed in range(6):
+        seen = [room.reset(seed=seed)[0]["image"] for room in (drawn, coded)]
+        for action in draw.integers(DONE, size=60):
+            picture, codes = seen
+            assert coded.observation_space["image"].contains(codes)
+            shown = assemble(tiles, torch.from_numpy(codes)).permute(1, 2, 0)
+            assert np.array_equal(shown, picture)
+            kinds |= set(codes.flatten().tolist())
+            seen = [room.step(action)[0]["image"] for room in (drawn, coded)]
+    assert len(kinds) > 15
 
 
 @pytest.mark.parametrize("level", ["GoToObj", "PickupLoc"])

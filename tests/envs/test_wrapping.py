@@ -241,3 +241,41 @@ def test_a_world_that_is_refused_is_closed():
     with pytest.raises(UserError, match="stop must be an action"):
         from_gymnasium(Kept, seed=0, stop=77, **DIAL)
     assert opened and all(world.closed for world in opened)
+
+
+class Coded(gymnasium.Wrapper):
+    """A dial whose image is the numbers of two tiles, one dark and one light."""
+
+    def __init__(self, tiles):
+        super().__init__(Dial())
+        self.tiles = tiles
+        self.observation_space = gymnasium.spaces.Dict(
+            {**self.env.observation_space, "view": MultiDiscrete(np.full((2, 3), 2), np.int16)}
+        )
+
+    def reset(self, **options):
+        seen, info = self.env.reset(**options)
+        return self.code(seen), info
+
+    def step(self, action):
+        seen, *rest = self.env.step(action)
+        return self.code(seen), *rest
+
+    def code(self, seen):
+        return {**seen, "view": np.array([[0, 1, 1], [1, 0, 1]], np.int16)}
+
+
+def test_a_world_may_show_numbers_of_its_tiles():
+    tiles = torch.tensor([0, 255], dtype=torch.uint8).view(2, 1, 1, 1).expand(2, 3, 8, 8)
+    env = from_gymnasium(lambda: Coded(tiles), num_envs=2, seed=0, **DIAL)
+    check_env_specs(env)
+    td = env.reset()
+    assert td["pixels"].dtype == torch.int16 and torch.equal(env.tiles, tiles)
+    policy = make_policy(env, seed=0)
+    codes = policy(td.clone())["logits"]
+    drawn = tiles[td["pixels"].long()].permute(0, 3, 1, 4, 2, 5).reshape(2, 3, 16, 24)
+    torch.testing.assert_close(policy(td.set("pixels", drawn))["logits"], codes)
+    with pytest.raises(UserError, match="tiles are uint8"):
+        from_gymnasium(lambda: Coded(tiles.float()), **DIAL)
+    with pytest.raises(UserError, match="images are bytes"):
+        from_gymnasium(lambda: Coded(None), **DIAL)

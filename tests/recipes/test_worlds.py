@@ -9,13 +9,13 @@ from torchrl.envs import TransformedEnv, UnaryTransform
 
 from envs import dial as dial_module
 from ifo_grounding import networks
-from ifo_grounding.data import Demonstrations
+from ifo_grounding.data import Demonstrations, labelled_buffer, show_codes
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
 from ifo_grounding.playground import Lesson
-from ifo_grounding.worlds import Grid, OpenGrid, World
+from ifo_grounding.worlds import BabyAI, Grid, OpenGrid, World
 
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
 
@@ -63,6 +63,13 @@ class Dimmed(Grid):
     def simulator(self, num_envs, *, seed, device="cpu"):
         shown = super().simulator(num_envs, seed=seed, device=device)
         return TransformedEnv(shown, UnaryTransform(["pixels"], ["pixels"], fn=lambda x: x // 2))
+
+
+class Larger(BabyAI):
+    """Rooms of a subclass, whose pictures may be other ones."""
+
+    def simulator(self, num_envs, **options):
+        return super().simulator(num_envs, **options)
 
 
 class Tiled(Grid):
@@ -179,6 +186,22 @@ def test_both_phases_run_in_babyai(options, tmp_path):
     run = tmp_path / "run"
     files = ("policy-phase1.safetensors", "reference-true-actions.safetensors")
     assert (run / files[0]).read_bytes() != (run / files[1]).read_bytes()
+
+
+def test_babyai_is_practised_in_codes_where_tiles_allow():
+    pytest.importorskip("minigrid")
+    demos, _ = BabyAI("GoToObj", processes=1).demonstrate(4, seed=0)
+    found = {}
+    for kind, tile_size in ((BabyAI, 8), (BabyAI, 10), (Larger, 8)):
+        world = kind("GoToObj", tile_size=tile_size)
+        world.vocabulary = demos.vocabulary
+        found[kind, tile_size] = world.coded(2, seed=0)
+        assert (world.tiles is None) == (found[kind, tile_size].tiles is None)
+    shown = {key: env.reset()["pixels"] for key, env in found.items()}
+    assert [each.dtype for each in shown.values()] == [torch.int16, torch.uint8, torch.uint8]
+    buffer = labelled_buffer(demos, torch.zeros(demos.transitions, dtype=torch.uint8))
+    show_codes(buffer, found[BabyAI, 8].tiles)
+    assert buffer[:]["pixels"].dtype == torch.int16  # the bot's frames are made of them
 
 
 def test_babyai_knows_no_splits(recipes):

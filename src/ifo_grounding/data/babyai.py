@@ -36,13 +36,40 @@ DONE = BABYAI_ACTIONS.index("done")
 """The action that does nothing: how a policy says that it is done."""
 PATIENCE = 3
 """How many times as many episodes as asked for are played before the bot counts as unable."""
+DOORS = ((True, False), (False, False), (False, True))
+"""Whether a door is open, and whether it is locked."""
 ENDINGS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a recording, which processes side by side leave to their parent."""
 
 Make = Callable[[], gymnasium.Env]
 
 
-def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
+@functools.cache
+def babyai_tiles(tile_size: int) -> Tensor:
+    """Return all that a cell of BabyAI's can look like, uint8 [K, 3, tile_size, tile_size]."""
+    from minigrid.core.grid import Grid
+
+    drawn = [Grid.render_tile(*look, tile_size=tile_size) for look in _looks().values()]
+    return torch.from_numpy(np.stack(drawn).astype(np.uint8)).permute(0, 3, 1, 2).contiguous()
+
+
+@functools.cache
+def _looks() -> dict[Any, tuple[Any, int | None]]:
+    """Return the things of a cell, each without and where it can be with the agent, by its name."""
+    from minigrid.core import world_object as kinds
+    from minigrid.core.constants import COLOR_NAMES
+
+    things: list[Any] = [None, kinds.Wall(), kinds.Goal(), kinds.Lava()]
+    for color in COLOR_NAMES:
+        things += [kind(color) for kind in (kinds.Floor, kinds.Key, kinds.Ball, kinds.Box)]
+        things += [kinds.Door(color, opened, locked) for opened, locked in DOORS]
+    looks: list[tuple[Any, int | None]] = [(thing, None) for thing in things]
+    under = [thing for thing in things if thing is None or thing.can_overlap()]
+    looks += [(thing, direction) for thing in under for direction in range(4)]
+    return {(thing and thing.encode(), direction): (thing, direction) for thing, direction in looks}
+
+
+def babyai(level: str, tile_size: int = 8, mission: str = "ends", codes: bool = False) -> Make:
     """Return a function that makes a level of BabyAI whose whole room is seen as a picture.
 
     What the agent carries is seen in the top left corner, so that a picture shows all there is.
@@ -54,6 +81,7 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
             has it; it ``waits`` until the policy is done, and then pays, also where the policy has
             undone the mission since; or there is ``none``, and the room goes on, for a learner
             that chooses its instructions itself.
+        codes: whether, in place of pixels, to show numbers of the room's ``tiles``, int16 [h, w].
 
     Raises:
         UserError: where minigrid is missing, or there is no such level.
@@ -64,13 +92,13 @@ def babyai(level: str, tile_size: int = 8, mission: str = "ends") -> Make:
     if name not in gymnasium.registry:
         ids = (each for each in gymnasium.registry if each.startswith("BabyAI-"))
         check_choice("level", level, sorted(each[7:-3] for each in ids))
-    return functools.partial(_Room, name, tile_size, mission)
+    return functools.partial(_Room, name, tile_size, mission, codes)
 
 
 class _Room(gymnasium.Wrapper):
     """Shows a level's whole room, and keeps it from printing whenever it draws a room anew."""
 
-    def __init__(self, name: str, tile_size: int, mission: str) -> None:
+    def __init__(self, name: str, tile_size: int, mission: str, codes: bool) -> None:
         # The observation is another than the one declared, which the checker would refuse.
         super().__init__(gymnasium.make(f"minigrid:{name}", disable_env_checker=True))
         self.tile_size, self.mission, self._earned = tile_size, mission, 0.0
@@ -78,7 +106,13 @@ class _Room(gymnasium.Wrapper):
         # In place of what the agent sees, whose computation takes longer than all else.
         level.gen_obs = self._look
         size = (level.height * tile_size, level.width * tile_size, 3)
-        image = gymnasium.spaces.Box(0, 255, size, np.uint8)
+        image: gymnasium.Space = gymnasium.spaces.Box(0, 255, size, np.uint8)
+        self._numbers: dict[Any, int] = {}
+        if codes:
+            self.tiles = babyai_tiles(tile_size)
+            self._numbers = {look: number for number, look in enumerate(_looks())}
+            kinds = np.full((level.height, level.width), len(self.tiles))
+            image = gymnasium.spaces.MultiDiscrete(kinds, dtype=np.int16)
         words = level.observation_space["mission"]
         self.observation_space = gymnasium.spaces.Dict({"image": image, "mission": words})
 
@@ -102,19 +136,28 @@ class _Room(gymnasium.Wrapper):
         return seen, self._earned if pays else 0.0, False, truncated, info
 
     def _look(self) -> dict[str, Any]:
-        """Draw the room and what is carried, uint8 [H, W, 3], beside the mission."""
+        """Show the room and what is carried, uint8 [H, W, 3] or codes, beside the mission."""
         grid, size = self.level.grid, self.tile_size
-        draw = functools.partial(grid.render_tile, tile_size=size)  # keeps what it has drawn
+        draw: Any = functools.partial(grid.render_tile, tile_size=size)  # keeps what it has drawn
+        if self._numbers:
+            draw = self._number
         tiles = [draw(cell) for cell in grid.grid]
         column, row = map(int, self.level.agent_pos)
         here = row * grid.width + column
         tiles[here] = draw(grid.grid[here], agent_dir=self.level.agent_dir)
         if self.level.carrying is not None:
             tiles[0] = draw(self.level.carrying)
+        if self._numbers:
+            codes = np.array(tiles, np.int16).reshape(grid.height, grid.width)
+            return {"image": codes, "mission": self.level.mission}
         pixels = np.concatenate(tiles).astype(np.uint8)
         cells = pixels.reshape(grid.height, grid.width, size, size, 3)
         image = cells.swapaxes(1, 2).reshape(grid.height * size, grid.width * size, 3)
         return {"image": image, "mission": self.level.mission}
+
+    def _number(self, thing: Any, agent_dir: int | None = None) -> int:
+        """Return the number of the tile that shows a thing, and the agent on it."""
+        return self._numbers[thing and thing.encode(), agent_dir]
 
 
 Played = tuple[np.ndarray, str, list[int]]

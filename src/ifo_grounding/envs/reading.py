@@ -14,11 +14,14 @@ from gymnasium import spaces
 from ifo_grounding import keys
 from ifo_grounding.channels import channels_first
 from ifo_grounding.errors import UserError, whole
+from ifo_grounding.mosaic import check_tiles
 from ifo_grounding.tasks.vocabulary import Vocabulary
 
 ENDED = "ended"
 """Whether a world has terminated, whether it was truncated, and whether the policy stopped."""
 ADD = "add"
+CODES = np.int16
+"""Type of the numbers of tiles."""
 
 
 def numbered_actions(space: gymnasium.Space, stop: int | str | None) -> tuple[int, int | None]:
@@ -74,10 +77,17 @@ class Reading(gymnasium.Wrapper):
             raise UserError(f"{self._name}.reset takes no seed: add seed=None, options=None")
         self.vocabulary, self.skip_unknown = vocabulary, skip_unknown
         self.image, self.instruction, self.instructed = image, instruction, instructed
+        self.tiles: Any = None
+        if env.has_wrapper_attr("tiles"):
+            self.tiles = env.get_wrapper_attr("tiles")
         self._last: dict[str, np.ndarray] | None = None
-        self._shape = self._pixels(self._begin(seed=0)).shape
+        first = self._pixels(self._begin(seed=0))
+        self._shape = first.shape
+        if coded := first.dtype == CODES:
+            check_tiles(self.tiles)
+        high: Any = len(self.tiles) - 1 if coded else 255
         parts: dict[str, gymnasium.Space] = {
-            keys.PIXELS: spaces.Box(0, 255, self._shape, np.uint8),
+            keys.PIXELS: spaces.Box(0, high, first.shape, first.dtype.type),
             ENDED: spaces.MultiBinary(3),
         }
         if instructed:
@@ -158,13 +168,18 @@ class Reading(gymnasium.Wrapper):
         return {**seen, keys.INSTRUCTION: self._tokens} if self.instructed else seen
 
     def _pixels(self, observation: Any) -> np.ndarray:
-        """Return the image, uint8 [C, H, W]; stacked frames [K, H, W, C] have K * C channels."""
+        """Return the image, uint8 [C, H, W]; stacked frames [K, H, W, C] have K * C channels.
+
+        Numbers of the world's tiles, int16 [h, w], stay as they are.
+        """
         if self.image is not None and self.image not in _names(observation):
             raise UserError(
                 f"there is no image {self.image!r} in the observation ({_names(observation)}): "
                 "name it with image=..., or image=None where the observation is the image"
             )
         picture = np.asarray(observation if self.image is None else observation[self.image])
+        if self.tiles is not None and picture.dtype == CODES and picture.ndim == 2:
+            return picture
         if picture.dtype != np.uint8 or picture.ndim not in (2, 3, 4):
             raise UserError(
                 f"images are bytes [H, W, C], [C, H, W] or [H, W], or a stack of them, got "

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from ifo_grounding import keys
 from ifo_grounding.envs.base import NumberedEnv
@@ -42,7 +43,8 @@ def from_gymnasium(
 ) -> GymnasiumEnv:
     """Put a Gymnasium world behind the keys of this library.
 
-    The world has to show an image of bytes, or a stack of them, and to take actions of a
+    The world has to show an image of bytes, or a stack of them, or numbers of its tiles, int16
+    [h, w], where it has an attribute ``tiles``, uint8 [K, C, T, T]. It has to take actions of a
     ``Discrete`` space, numbered from 0 here; its instruction is a sentence in the observation or in
     ``info``, which stays throughout an episode. Episodes end as the world says,
     and its reward is the true one: for evaluation alone, which counts an episode as a success where
@@ -71,7 +73,7 @@ def from_gymnasium(
         make_options: for :func:`gymnasium.make`.
 
     Returns:
-        An environment of batch size [num_envs] with ``pixels``, uint8 [N, C, H, W], and
+        An environment of batch size [num_envs] with ``pixels``, uint8 [N, C, H, W] or codes, and
         ``instruction``, int64 [N, L]. ``reset`` takes ``"scene"`` as
         :class:`~ifo_grounding.envs.PickAndPlaceEnv` does: the same number is the same scene, as
         far as the world obeys its seed.
@@ -157,8 +159,17 @@ class GymnasiumEnv(NumberedEnv):
         self.n_actions = int(worlds.single_action_space.n)  # type: ignore[attr-defined]
         self.stop_action = worlds.get_attr("stop")[0]  # type: ignore[attr-defined]
         """The action by which a policy ends an episode, or None."""
-        pixels = worlds.single_observation_space[keys.PIXELS]  # type: ignore[index]
-        self._declare(self._bounded(255, *pixels.shape, dtype=torch.uint8), self.n_actions)
+        shown: Any = worlds.single_observation_space[keys.PIXELS]  # type: ignore[index]
+        self.tiles: Tensor | None = None
+        """What the numbers in ``pixels`` stand for, where they are numbers."""
+        dtype = torch.uint8
+        if len(shown.shape) == 2:
+            (tiles, *_), dtype = worlds.get_attr("tiles"), torch.int16  # type: ignore[attr-defined]
+            self.tiles = tiles.to(self.device)
+            _, channels, _, size = tiles.shape
+            self.image_shape = (channels, *(size * side for side in shown.shape))
+        high = int(shown.high.max())
+        self._declare(self._bounded(high, *shown.shape, dtype=dtype), self.n_actions)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask, numbers = self._asked(tensordict)

@@ -9,15 +9,16 @@ from omegaconf import MISSING
 from torch import Tensor
 
 from ifo_grounding.data import Demonstrations, Truth, babyai, bot_outcomes, record_babyai
-from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE
+from ifo_grounding.data.babyai import BABYAI_ACTIONS, DONE, babyai_tiles
 from ifo_grounding.envs import GymnasiumEnv, from_gymnasium
 from ifo_grounding.errors import UserError, check_choice
 from ifo_grounding.machine import cores
-from ifo_grounding.worlds.base import World
+from ifo_grounding.mosaic import PIXELS_PER_WORD
+from ifo_grounding.worlds.base import Tiled
 
 
 @dataclass
-class BabyAI(World):
+class BabyAI(Tiled):
     """A level of BabyAI, its whole room seen as a picture; needs the extra ``babyai``."""
 
     level: str = MISSING
@@ -32,16 +33,21 @@ class BabyAI(World):
         babyai(self.level, self.tile_size)  # refuses what is no level
         self.actions, self.stop_action = BABYAI_ACTIONS, DONE
 
-    def simulator(self, num_envs: int, **options: Any) -> GymnasiumEnv:
+    def simulator(self, num_envs: int, *, codes: bool = False, **options: Any) -> GymnasiumEnv:
         """Return rooms without missions; see :class:`World`."""
-        return self._rooms("none", num_envs, **options)
+        return self._rooms("none", num_envs, codes and self.tiles is not None, **options)
+
+    @property
+    def tiles(self) -> Tensor | None:  # type: ignore[override]
+        """All that a cell can look like, where codes can be read."""
+        return None if self.tile_size % PIXELS_PER_WORD else babyai_tiles(self.tile_size)
 
     def instructed(
         self, num_envs: int, *, split: str = "all", waits: bool = False, **options: Any
     ) -> GymnasiumEnv:
         """Return rooms with their missions, which end with them unless they are to wait."""
         check_choice("evaluate.split of BabyAI", split, ["all"])
-        return self._rooms("waits" if waits else "ends", num_envs, **options)
+        return self._rooms("waits" if waits else "ends", num_envs, False, **options)
 
     def demonstrate(self, n: int, **options: Any) -> tuple[Demonstrations, Truth | None]:
         """Let the bot demonstrate, and keep its actions apart."""
@@ -58,11 +64,11 @@ class BabyAI(World):
     def _processes(self) -> int:
         return self.processes or cores()
 
-    def _rooms(self, mission: str, num_envs: int, **options: Any) -> GymnasiumEnv:
+    def _rooms(self, mission: str, num_envs: int, codes: bool, **options: Any) -> GymnasiumEnv:
         if self.vocabulary is None:
             raise UserError("record demonstrations first: they hold the words of the missions")
         return from_gymnasium(
-            babyai(self.level, self.tile_size, mission),
+            babyai(self.level, self.tile_size, mission, codes),
             vocabulary=self.vocabulary,
             num_envs=num_envs,
             instructed=mission != "none",

@@ -147,3 +147,23 @@ class World(ABC):
                 "(load_lerobot(size=...)), and save() what you read"
             )
         return demos
+
+
+class Tiled(World):
+    """A world whose simulator shows numbers of tiles in place of pixels, with ``codes=True``."""
+
+    simulator: Any
+
+    def __init_subclass__(cls) -> None:
+        """Let a simulator that a subclass has changed show pixels, which may be other ones."""
+        if Tiled not in cls.__bases__ and "simulator" in vars(cls) and "coded" not in vars(cls):
+            cls.coded, cls.tiles = World.coded, None  # type: ignore[method-assign,assignment]
+
+    def coded(self, num_envs: int, **options: Any) -> EnvBase:
+        """Return the simulator in codes; see :class:`World`."""
+        return self.simulator(num_envs, codes=True, **options)
+
+    @property
+    def tiles(self) -> Tensor | None:  # type: ignore[override]
+        """What the numbers that :meth:`coded` shows stand for."""
+        return getattr(self.coded(1, seed=0), "tiles", None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,31 +19,7 @@ from ifo_grounding.evaluation import Endings, SuitabilityResult, episode_endings
 from ifo_grounding.seeding import derive
 from ifo_grounding.tasks import REASONS, VOCABULARY, grammar, verdict
 from ifo_grounding.world import Layout
-from ifo_grounding.worlds.base import World
-
-
-class Tiled(World):
-    """A world of which the simulator can show numbers of tiles in place of pixels."""
-
-    actions, stop_action = keys.ACTIONS, keys.STOP
-
-    def __init_subclass__(cls) -> None:
-        """Let a simulator that a subclass has changed show pixels, which may be other ones."""
-        if Tiled not in cls.__bases__ and "simulator" in vars(cls) and "coded" not in vars(cls):
-            cls.coded, cls.tiles = World.coded, None  # type: ignore[method-assign,assignment]
-
-    @abstractmethod
-    def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
-        """Return worlds without instructions and true rewards; see :class:`World`."""
-
-    def coded(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
-        """Return the simulator in codes; see :class:`World`."""
-        return self.simulator(num_envs, codes=True, **options)
-
-    @property
-    def tiles(self) -> Tensor | None:  # type: ignore[override]
-        """What the numbers that :meth:`coded` shows stand for."""
-        return self.coded(1, seed=0).tiles
+from ifo_grounding.worlds.base import Tiled
 
 
 @dataclass
@@ -55,6 +30,7 @@ class Grid(Tiled):
     torch.Size([4])
     """
 
+    actions, stop_action = keys.ACTIONS, keys.STOP
     task: str = MISSING
     """``move``, ``move-udlr``, ``pick``, ``pick-out`` or ``pick-udlr``."""
     tile_size: int = 8
@@ -142,6 +118,7 @@ class Grid(Tiled):
 class OpenGrid(Tiled):
     """The same grid with sentences of a person's own, of which nobody knows what fulfils them."""
 
+    actions, stop_action = keys.ACTIONS, keys.STOP
     rewarded = False
 
     def simulator(self, num_envs: int, **options: Any) -> PickAndPlaceEnv:
