@@ -267,6 +267,7 @@ def adversarial(options: Options, stage: Stage) -> None:
         log=stage.log(),
         callback=validation_success(policy, rounds, options),
         progress=options.progress,
+        cudagraph=True,
     )
     save_network(run, file_of(method), policy)
     finish(options, stage, {"of": plain(section), **history[-1]}, history)
