@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import Compose, TransformedEnv
 
 from ifo_grounding.data import labelled_buffer, record_demonstrations
@@ -20,6 +21,7 @@ from ifo_grounding.training import (
     fit,
     self_examine,
 )
+from ifo_grounding.training.policy_gradient import Learner
 from ifo_grounding.training.updates import let_capture, make_optimizer, set_rates
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 
@@ -99,3 +101,28 @@ def test_captured_practice_learns_what_single_kernels_learn(algorithm):
         found[cudagraph] = torch.tensor([row["loss_imitation"] for row in history])
     assert (found[True] - found[False]).abs().max() < 0.1, found
     assert found[True][-1] < found[True][0]
+
+
+@pytest.mark.gpu
+def test_neither_the_world_nor_an_update_waits_for_the_gpu():
+    env = PickAndPlaceEnv("move", 64, seed=0, device="cuda", codes=True)
+    reward = LearnedReward(make_reward_model(env, seed=0, device="cuda"))
+    policy = make_policy(env, seed=0, device="cuda").eval()
+    value = make_value(env, seed=0, device="cuda", init_from=policy).eval()
+    learner = Learner(policy, value, SelfExaminationConfig(steps=4, minibatch=64, epochs=2))
+    learner.prepare(captured=True)
+    with torch.no_grad():
+        batch = TransformedEnv(env, reward).rollout(4, policy, break_when_any_done=False)
+    learner.improve(batch, iteration=3)  # captures
+    steps = TensorDict({"collected": batch.exclude("next").reshape(-1)[:64]}, device="cuda")
+    world, actions = env._simulator, torch.randint(6, (12, 64), device="cuda")
+    world.reset()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for action in actions:
+            _, terminated, truncated = world.step(action)
+            world.reset(terminated | truncated)
+        metrics = learner.captured(steps)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert learner.captured.graph is not None and metrics["loss_objective"].isfinite()
