@@ -55,7 +55,7 @@ def babyai_tiles(tile_size: int) -> Tensor:
 
 @functools.cache
 def _looks() -> dict[Any, tuple[Any, int | None]]:
-    """Return the things of a cell, each without and where it can be with the agent, by its name."""
+    """Return what a cell can show, a thing and the agent's direction, by what MiniGrid calls it."""
     from minigrid.core import world_object as kinds
     from minigrid.core.constants import COLOR_NAMES
 

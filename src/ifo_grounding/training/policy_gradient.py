@@ -25,8 +25,11 @@ AT_ONCE = 2048
 """Steps whose values are estimated together, to bound memory."""
 
 
-class PPOLoss(ClipPPOLoss):
-    """TorchRL's loss, which waits for the GPU to see whether entropies of logits are finite."""
+class _ClipPPOLoss(ClipPPOLoss):
+    """TorchRL's loss without its wait for a GPU, to see whether entropies are finite.
+
+    Those of a categorical are.
+    """
 
     def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Any:
         if isinstance(dist, Categorical):
@@ -54,7 +57,7 @@ class Learner:
         )
         self.loss: LossModule
         if config.algorithm == "ppo":
-            self.loss = PPOLoss(
+            self.loss = _ClipPPOLoss(
                 policy,
                 value,
                 clip_epsilon=config.clip,
@@ -101,6 +104,6 @@ class Learner:
                 parts = TensorDict({"collected": steps[rows]}, device=steps.device)
                 if self.imitation:
                     parts["demonstrated"] = self.imitation.sample()
-                whole = len(rows) == min(config.minibatch, len(steps))
+                whole = len(rows) == min(config.minibatch, len(steps))  # all that a graph takes
                 updates.append(self.captured(parts) if whole else self.update(parts))
         return means(updates)
