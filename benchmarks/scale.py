@@ -85,7 +85,7 @@ def babyai() -> tuple[BabyAI, Compose, nn.Module, Learner]:
     )
     goal = GoalReward(networks.make_goal_classifier(shown, seed=0), stop_action=world.stop_action)
     learner = Learner(policy, value, SelfExaminationConfig(steps=STEPS))
-    learner.prepare(captured=False)
+    learner.prepare(cudagraph=False)
     return world, Compose(sampler, goal), policy, learner
 
 

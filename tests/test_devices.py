@@ -174,7 +174,7 @@ def test_a_step_of_practice_asks_a_gpu_nothing(preset, algorithm):
         imitation = AuxiliaryImitation(ImitationLoss(policy), buffer, weight=0.1, batch_size=16)
         config = SelfExaminationConfig(algorithm, steps=4, minibatch=20, value_warmup=0, epochs=1)
         learner, asked = Learner(policy, value, config, imitation), []
-        learner.prepare(captured=True)
+        learner.prepare(cudagraph=True)
         captured = learner.captured
 
         def watched(batch):

@@ -110,7 +110,7 @@ def test_neither_the_world_nor_an_update_waits_for_the_gpu():
     policy = make_policy(env, seed=0, device="cuda").eval()
     value = make_value(env, seed=0, device="cuda", init_from=policy).eval()
     learner = Learner(policy, value, SelfExaminationConfig(steps=4, minibatch=64, epochs=2))
-    learner.prepare(captured=True)
+    learner.prepare(cudagraph=True)
     with torch.no_grad():
         batch = TransformedEnv(env, reward).rollout(4, policy, break_when_any_done=False)
     learner.improve(batch, iteration=3)  # captures

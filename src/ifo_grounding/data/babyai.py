@@ -36,8 +36,6 @@ DONE = BABYAI_ACTIONS.index("done")
 """The action that does nothing: how a policy says that it is done."""
 PATIENCE = 3
 """How many times as many episodes as asked for are played before the bot counts as unable."""
-DOORS = ((True, False), (False, False), (False, True))
-"""Whether a door is open, and whether it is locked."""
 ENDINGS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end a recording, which processes side by side leave to their parent."""
 
@@ -49,24 +47,35 @@ def babyai_tiles(tile_size: int) -> Tensor:
     """Return all that a cell of BabyAI's can look like, uint8 [K, 3, tile_size, tile_size]."""
     from minigrid.core.grid import Grid
 
-    drawn = [Grid.render_tile(*look, tile_size=tile_size) for look in _looks().values()]
+    drawn = [Grid.render_tile(*look, tile_size=tile_size) for look in _looks()]
     return torch.from_numpy(np.stack(drawn).astype(np.uint8)).permute(0, 3, 1, 2).contiguous()
 
 
 @functools.cache
-def _looks() -> dict[Any, tuple[Any, int | None]]:
-    """Return what a cell can show, a thing and the agent's direction, by what MiniGrid calls it."""
+def _looks() -> list[tuple[Any, int | None]]:
+    """Return what a cell can show: a thing or none, and the agent's direction or none."""
     from minigrid.core import world_object as kinds
     from minigrid.core.constants import COLOR_NAMES
 
     things: list[Any] = [None, kinds.Wall(), kinds.Goal(), kinds.Lava()]
     for color in COLOR_NAMES:
         things += [kind(color) for kind in (kinds.Floor, kinds.Key, kinds.Ball, kinds.Box)]
-        things += [kinds.Door(color, opened, locked) for opened, locked in DOORS]
-    looks: list[tuple[Any, int | None]] = [(thing, None) for thing in things]
+        things += [kinds.Door(color, is_open=True), kinds.Door(color)]
+        things += [kinds.Door(color, is_locked=True)]
     under = [thing for thing in things if thing is None or thing.can_overlap()]
-    looks += [(thing, direction) for thing in under for direction in range(4)]
-    return {(thing and thing.encode(), direction): (thing, direction) for thing, direction in looks}
+    facing = [(thing, direction) for thing in under for direction in range(4)]
+    return [*((thing, None) for thing in things), *facing]
+
+
+@functools.cache
+def _numbers() -> dict[Any, int]:
+    """Return the number of the tile of each look."""
+    return {(thing and thing.encode(), seen): n for n, (thing, seen) in enumerate(_looks())}
+
+
+def _number(thing: Any, agent_dir: int | None = None) -> int:
+    """Return the number of the tile that shows a thing, and the agent on it."""
+    return _numbers()[thing and thing.encode(), agent_dir]
 
 
 def babyai(level: str, tile_size: int = 8, mission: str = "ends", codes: bool = False) -> Make:
@@ -107,10 +116,9 @@ class _Room(gymnasium.Wrapper):
         level.gen_obs = self._look
         size = (level.height * tile_size, level.width * tile_size, 3)
         image: gymnasium.Space = gymnasium.spaces.Box(0, 255, size, np.uint8)
-        self._numbers: dict[Any, int] = {}
+        self.codes = codes
         if codes:
             self.tiles = babyai_tiles(tile_size)
-            self._numbers = {look: number for number, look in enumerate(_looks())}
             kinds = np.full((level.height, level.width), len(self.tiles))
             image = gymnasium.spaces.MultiDiscrete(kinds, dtype=np.int16)
         words = level.observation_space["mission"]
@@ -138,26 +146,22 @@ class _Room(gymnasium.Wrapper):
     def _look(self) -> dict[str, Any]:
         """Show the room and what is carried, uint8 [H, W, 3] or codes, beside the mission."""
         grid, size = self.level.grid, self.tile_size
-        draw: Any = functools.partial(grid.render_tile, tile_size=size)  # keeps what it has drawn
-        if self._numbers:
-            draw = self._number
+        draw: Any = _number
+        if not self.codes:
+            draw = functools.partial(grid.render_tile, tile_size=size)  # keeps what it has drawn
         tiles = [draw(cell) for cell in grid.grid]
         column, row = map(int, self.level.agent_pos)
         here = row * grid.width + column
         tiles[here] = draw(grid.grid[here], agent_dir=self.level.agent_dir)
         if self.level.carrying is not None:
             tiles[0] = draw(self.level.carrying)
-        if self._numbers:
+        if self.codes:
             codes = np.array(tiles, np.int16).reshape(grid.height, grid.width)
             return {"image": codes, "mission": self.level.mission}
         pixels = np.concatenate(tiles).astype(np.uint8)
         cells = pixels.reshape(grid.height, grid.width, size, size, 3)
         image = cells.swapaxes(1, 2).reshape(grid.height * size, grid.width * size, 3)
         return {"image": image, "mission": self.level.mission}
-
-    def _number(self, thing: Any, agent_dir: int | None = None) -> int:
-        """Return the number of the tile that shows a thing, and the agent on it."""
-        return self._numbers[thing and thing.encode(), agent_dir]
 
 
 Played = tuple[np.ndarray, str, list[int]]

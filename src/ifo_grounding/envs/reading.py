@@ -83,11 +83,12 @@ class Reading(gymnasium.Wrapper):
         self._last: dict[str, np.ndarray] | None = None
         first = self._pixels(self._begin(seed=0))
         self._shape = first.shape
-        if coded := first.dtype == CODES:
+        values = 256
+        if first.dtype == CODES:
             check_tiles(self.tiles)
-        high: Any = len(self.tiles) - 1 if coded else 255
+            values = len(self.tiles)
         parts: dict[str, gymnasium.Space] = {
-            keys.PIXELS: spaces.Box(0, high, first.shape, first.dtype.type),
+            keys.PIXELS: spaces.Box(0, values - 1, first.shape, first.dtype.type),
             ENDED: spaces.MultiBinary(3),
         }
         if instructed:

@@ -75,9 +75,9 @@ class Learner:
         self.optimizer = make_optimizer(actor, config.lr)
         self.optimizer.add_param_group({"params": list(value.parameters())})
 
-    def prepare(self, captured: bool) -> None:
-        """Make updates as CUDA graphs or kernel by kernel, with the optimizer as it now is."""
-        self.captured = prepared(self.update, self.optimizer, captured)
+    def prepare(self, cudagraph: bool) -> None:
+        """Make updates with the optimizer as it now is, on a GPU as CUDA graphs if wanted."""
+        self.captured = prepared(self.update, self.optimizer, cudagraph)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Make one gradient step on collected and, beside them, demonstrated steps."""

@@ -17,7 +17,6 @@ from ifo_grounding import keys
 from ifo_grounding.attributes import first_worker, untransformed
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range
 from ifo_grounding.machine import release_freed_memory
-from ifo_grounding.modules import device_of
 from ifo_grounding.seeding import derive
 from ifo_grounding.training.auxiliary import AdversarialUpdates, AuxiliaryImitation
 from ifo_grounding.training.checkpoint import Checkpoint
@@ -195,8 +194,7 @@ def improve_policy(
     settings = {**asdict(config), "seed": seed, "worlds": env.batch_size.numel()}
     saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
     loop = Loop(NAME, config.iterations, saved, checkpoint_seconds, log, progress)
-    on_gpu = getattr(device_of(policy), "type", None) == "cuda"
-    learner.prepare(cudagraph and on_gpu and (imitation is None or imitation.loss.capturable))
+    learner.prepare(cudagraph and (imitation is None or imitation.loss.capturable))
     every = config.select_every
     if every and not loop.history:
         best.measure()

@@ -153,13 +153,12 @@ def fit(
     saved = Checkpoint(checkpoint, settings, **parts) if checkpoint else None
     loop = Loop(name, pause_at, saved, checkpoint_seconds, log, progress)
     same_steps = getattr(loss, "capturable", False) and isinstance(sampler, RandomSampler)
-    captured = cudagraph and device.type == "cuda" and same_steps and processes() == 1
     shared = averaging(loss)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
         return update(shared(batch), optimizer, config.grad_clip)
 
-    make_step = prepared(step, optimizer, captured)
+    make_step = prepared(step, optimizer, cudagraph and same_steps and processes() == 1)
     for iteration in loop:
         first = iteration * config.iteration
         steps = range(first, min(first + config.iteration, config.steps))

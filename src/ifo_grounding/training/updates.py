@@ -123,8 +123,9 @@ class CapturedUpdate:
         return metrics
 
 
-def prepared(step: Update, optimizer: torch.optim.Optimizer, captured: bool) -> Update:
-    """Return a step that steps an optimizer, as a CUDA graph or kernel by kernel."""
+def prepared(step: Update, optimizer: torch.optim.Optimizer, cudagraph: bool) -> Update:
+    """Return a step that steps an optimizer, on a GPU as a CUDA graph if that is wanted."""
+    captured = cudagraph and optimizer.param_groups[0]["params"][0].is_cuda
     let_capture(optimizer, captured)
     return CapturedUpdate(step) if captured else step
 

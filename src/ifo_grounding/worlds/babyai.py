@@ -35,7 +35,8 @@ class BabyAI(Tiled):
 
     def simulator(self, num_envs: int, *, codes: bool = False, **options: Any) -> GymnasiumEnv:
         """Return rooms without missions; see :class:`World`."""
-        return self._rooms("none", num_envs, codes and self.tiles is not None, **options)
+        codes = codes and self.tiles is not None
+        return self._rooms("none", num_envs, codes=codes, **options)
 
     @property
     def tiles(self) -> Tensor | None:  # type: ignore[override]
@@ -47,7 +48,7 @@ class BabyAI(Tiled):
     ) -> GymnasiumEnv:
         """Return rooms with their missions, which end with them unless they are to wait."""
         check_choice("evaluate.split of BabyAI", split, ["all"])
-        return self._rooms("waits" if waits else "ends", num_envs, False, **options)
+        return self._rooms("waits" if waits else "ends", num_envs, **options)
 
     def demonstrate(self, n: int, **options: Any) -> tuple[Demonstrations, Truth | None]:
         """Let the bot demonstrate, and keep its actions apart."""
@@ -64,7 +65,9 @@ class BabyAI(Tiled):
     def _processes(self) -> int:
         return self.processes or cores()
 
-    def _rooms(self, mission: str, num_envs: int, codes: bool, **options: Any) -> GymnasiumEnv:
+    def _rooms(
+        self, mission: str, num_envs: int, codes: bool = False, **options: Any
+    ) -> GymnasiumEnv:
         if self.vocabulary is None:
             raise UserError("record demonstrations first: they hold the words of the missions")
         return from_gymnasium(

@@ -152,8 +152,6 @@ class World(ABC):
 class Tiled(World):
     """A world whose simulator shows numbers of tiles in place of pixels, with ``codes=True``."""
 
-    simulator: Any
-
     def __init_subclass__(cls) -> None:
         """Let a simulator that a subclass has changed show pixels, which may be other ones."""
         if Tiled not in cls.__bases__ and "simulator" in vars(cls) and "coded" not in vars(cls):
@@ -161,7 +159,7 @@ class Tiled(World):
 
     def coded(self, num_envs: int, **options: Any) -> EnvBase:
         """Return the simulator in codes; see :class:`World`."""
-        return self.simulator(num_envs, codes=True, **options)
+        return self.simulator(num_envs, codes=True, **options)  # type: ignore[call-arg]
 
     @property
     def tiles(self) -> Tensor | None:  # type: ignore[override]
