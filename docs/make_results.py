@@ -28,7 +28,7 @@ def runs_of(folder: str, order: Sequence[str]) -> dict[tuple[str, int], Runs]:
 
 
 def studied() -> dict[tuple[str, int], Runs]:
-    """Return the runs of each task and number of demonstrations, the newest where there are two."""
+    """Return the runs of each task and number of demonstrations."""
     found = runs_of("study", TASKS) | runs_of("few", TASKS)
     return dict(sorted(found.items(), key=lambda item: (TASKS.index(item[0][0]), item[0][1])))
 

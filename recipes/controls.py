@@ -21,7 +21,8 @@ def continue_imitation(options: Options) -> dict:
     run = stage.run
     policy = load_network(run, POLICIES["phase1"], "imitate", options)
     seen, aside = labelled_demonstrations(run, options.imitate.held_out)
-    config = replace(options.imitate, steps=matched_steps(options), lr=options.controls.lr)
+    steps, batch = matched_steps(options), section.minibatch
+    config = replace(options.imitate, steps=steps, batch_size=batch, lr=options.controls.lr)
     best = None
     if section.select_every:
         reward = learned_reward(run, options)
@@ -42,7 +43,7 @@ def continue_imitation(options: Options) -> dict:
 
 
 def matched_steps(options: Options) -> int:
-    """Return how many batches of imitation are as many gradient samples as phase 2 takes.
+    """Return how many of phase 2's minibatches are as many gradient samples as it takes.
 
     Every step that phase 2 collects passes policy and critic in each epoch, and the policy once
     more when it is played, which costs a third of a gradient. The auxiliary imitation comes on top.
@@ -53,7 +54,7 @@ def matched_steps(options: Options) -> int:
     samples = collected * (2 * epochs + 1 / 3)
     if section.imitation_weight:
         samples += collected / section.minibatch * epochs * AuxiliaryImitation.batch_size
-    return round(samples / options.imitate.batch_size)
+    return max(1, round(samples / section.minibatch))
 
 
 @recipe_main
