@@ -43,6 +43,7 @@ class Here:
             return_same_td=env.device is not None and env.device.type == "cpu",
             reset_at_each_iter=True,
             trust_policy=True,
+            track_traj_ids=False,  # which would wait for a GPU at every step
             auto_register_policy_transforms=False,
         )
         self.batches = iter(self.collector)
@@ -155,7 +156,10 @@ class OnRay:
             total_frames=-1,
             sync=True,
             collector_class=Worker,
-            collector_kwargs=[{"auto_register_policy_transforms": False} for _ in range(count)],
+            collector_kwargs=[
+                {"auto_register_policy_transforms": False, "track_traj_ids": False}
+                for _ in range(count)
+            ],
             reset_at_each_iter=True,
             trust_policy=True,
             remote_configs={
