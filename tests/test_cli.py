@@ -15,6 +15,7 @@ import ifo_grounding.options  # noqa: F401  (its packages set variables as they 
 from ifo_grounding import cli
 from ifo_grounding.cli import recipe_names, recipes_folder
 from ifo_grounding.errors import UserError
+from ifo_grounding.training import Run
 
 RECIPE = """
 import os, signal
@@ -150,7 +151,11 @@ def test_help_of_a_recipe_shows_what_it_reads_and_has_of_its_own(capsys):
     assert "\n  imitate.lr=" in printed and "\n  networks.dropout=" in printed
     assert "self_examine" not in printed and "ifo-grounding demo --help" in printed
     assert run("demo", "--help") == 0
-    assert re.search(r"world\.size=6 +Cells along one side", capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    assert printed.startswith("demo: ")
+    assert re.search(r"world\.size=6 +Cells along one side", printed)
+    assert re.search(r"inverse\.grad_clip=1\.0 +Largest norm", printed)
+    assert re.search(r"imitate\.grad_clip=1\.0\n", printed)  # as of the inverse model, above
     assert run("run", "reproduce", "table=2", "--help") == 0
     printed = capsys.readouterr().out
     assert "\n  table=2 " in printed and "Of the paper: 1, with a success" in printed
@@ -165,6 +170,12 @@ def test_the_package_is_the_command_too(module, capsys, monkeypatch):
     monkeypatch.delitem(sys.modules, "ifo_grounding.cli")
     runpy.run_module(module, run_name="__main__")
     assert capsys.readouterr().out.startswith("ifo-grounding ")
+
+
+def test_help_tells_of_a_new_run_whatever_an_old_one_was_made_with(tmp_path, capsys):
+    Run(tmp_path / "run").begin({"level": None, "task": "pick"})
+    assert run("demo", f"run={tmp_path / 'run'}", "--help") == 0
+    assert "\n  task=move " in capsys.readouterr().out
 
 
 def test_help_ends_where_its_reader_does():

@@ -72,8 +72,8 @@ def recipe_main(function: Callable[[Any], object]) -> Callable[[], None]:
             from ifo_grounding.options import help_text, options_of_jobs
 
             words = [word for word in sys.argv[1:] if word not in HELP]
-            found, jobs = [], options_of_jobs(script, words)
             help_asked = len(words) < len(sys.argv) - 1
+            found, jobs = [], options_of_jobs(script, words, new=help_asked)
             if not help_asked:
                 _run_on_cluster(script, words, jobs)  # what is done is only told below
             for options in jobs:

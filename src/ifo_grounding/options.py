@@ -77,10 +77,11 @@ def options_of(*overrides: str) -> Options:
         return _settled(overrides)
 
 
-def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
+def options_of_jobs(script: Path, arguments: Sequence[str], new: bool = False) -> list[Any]:
     """Return the options of each job that a command line asks of a script, one mostly.
 
-    A script with a ``conf/<its name>.yaml`` has options of its own.
+    A script with a ``conf/<its name>.yaml`` has options of its own. With ``new``, they are those of
+    a run that has not begun.
     """
     own = (script.parent / "conf" / f"{script.stem}.yaml").exists()
     with _composing(script.parent):
@@ -93,7 +94,7 @@ def options_of_jobs(script: Path, arguments: Sequence[str]) -> list[Any]:
             for each in composed:
                 _refuse_unknown(known, each)
             return [OmegaConf.to_object(each) for each in composed]
-        return [_settled(job) for job in jobs]
+        return [_settled(job, new) for job in jobs]
 
 
 def words_of_jobs(arguments: Sequence[str]) -> list[list[str]]:
@@ -147,7 +148,7 @@ def _combinations(words: Sequence[str]) -> list[list[str]]:
     return [[*job] for job in itertools.product(*given)]
 
 
-def _settled(overrides: Sequence[str]) -> Options:
+def _settled(overrides: Sequence[str], new: bool = False) -> Options:
     """Return composed options as dataclasses: those of the run, where it has begun.
 
     What a run was made with wins over what a command does not name, but for what is of one command
@@ -170,7 +171,7 @@ def _settled(overrides: Sequence[str]) -> Options:
         cfg = compose(CONFIG, words + few)
     if counted:  # all that were recorded, not as many as the budget would record
         cfg.demonstrations.n = number
-    made = Run(cfg.run).options()
+    made = None if new else Run(cfg.run).options()
     return _typed(cfg if made is None else _goes_on(cfg, made, named))
 
 
@@ -257,23 +258,29 @@ def explained(error: Exception) -> UserError:
 
 def help_text(script: Path, options: Any) -> str:
     """Return the options that a recipe reads, with their values and meanings, by section."""
-    lines = [f"{script.stem}: options are written name=value, in a section section.name=value.", ""]
+    name = "demo" if script.stem == "two_phase" else script.stem
+    lines = [f"{name}: options are written name=value, in a section section.name=value."]
+    lines += ["One without a text means what its namesake above does.", ""]
     for group in ("preset", "budget", "world") if isinstance(options, Options) else ():
         for path in sorted((recipes_folder() / "conf" / group).glob("*.yaml")):
             said = " ".join(re.findall(r"^# (.*)", path.read_text(), re.M))  # command: meaning
             lines += _row(f"{group}={path.stem}", said.partition(": ")[2])
-    values, some = plain(options), isinstance(options, Options) and script.stem != "two_phase"
+    values, some = plain(options), isinstance(options, Options) and name != "demo"
     if some:
         text = script.read_text()
         read = {*re.findall(r"options\.(\w+)", text), *(READ[n] for n in READ if f"{n}(" in text)}
         values = {k: v for k, v in values.items() if k in read or not isinstance(v, dict)}
-    lines += ["", *described(type(options), values)]
+    lines += ["", *described(type(options), values, set())]
     return "\n".join(lines + ["", "all options: ifo-grounding demo --help"] * some)
 
 
-def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[str]:
-    """Write the options of a dataclass that have values, those with options of their own last."""
-    docs = field_docs(kind)
+def described(kind: type, values: dict[str, Any], said: set[str], above: str = "") -> Iterator[str]:
+    """Write the options of a dataclass that have values, those with options of their own last.
+
+    What was ``said`` of others is not said again.
+    """
+    docs = {n: m for n, m in field_docs(kind).items() if m not in said}
+    said |= {m for n, m in docs.items() if n in values}
     there = [each for each in dataclasses.fields(kind) if each.name in values]
     fields = sorted(there, key=lambda each: isinstance(values[each.name], dict))
     for each in fields:
@@ -284,7 +291,7 @@ def described(kind: type, values: dict[str, Any], above: str = "") -> Iterator[s
             heading = str(inspect.getdoc(inner)) if typed else docs.get(each.name, "")
             yield f"\n{name}: {' '.join(heading.split())}"
             if typed:
-                yield from described(inner, value, f"{name}.")
+                yield from described(inner, value, said, f"{name}.")
             else:
                 told: dict[str, str] = {}
                 with contextlib.suppress(Exception):  # whatever an own module raises
