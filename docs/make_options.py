@@ -24,7 +24,7 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
 
 def described() -> str:
     """Return every option with its value and meaning, as Markdown."""
-    composed = (options_of(f"preset={name}", UNMADE) for name in ("strong", "paper"))
+    composed = (options_of(f"preset={name}", "budget=demo", UNMADE) for name in ("strong", "paper"))
     presets = [replace(each, run=Options.run) for each in composed]
     values = {name: [getattr(each, name) for each in presets] for name in SECTIONS}
     general, learning = field_docs(Options), field_docs(FitConfig)

@@ -52,7 +52,7 @@ class PickAndPlaceEnv(NumberedEnv):
     and, where it is no observation (``"pixels"``, ``"done"``) and the worlds are instructed, an
     ``"instruction"`` of the task, int64 [*B, 16], and a ``"state"``, a
     :class:`~ifo_grounding.world.WorldState` [*B], in place of the scene's own. An instruction that
-    does not suit is never rewarded.
+    cannot be fulfilled is never rewarded.
 
     >>> env = PickAndPlaceEnv("pick-out", num_envs=4, seed=0)
     >>> rollout = env.rollout(40, break_when_any_done=False)

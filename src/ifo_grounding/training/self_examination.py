@@ -44,7 +44,7 @@ class SelfExaminationConfig:
     lr: float = 2e-4
     """Learning rate of the policy (paper: 3e-5)."""
     value_lr: float = 8e-4
-    """Learning rate of the value head."""
+    """Learning rate of the critic."""
     anneal: bool = False
     """Lower both learning rates linearly, to nothing after the last iteration."""
     gamma: float = 0.99
@@ -60,7 +60,7 @@ class SelfExaminationConfig:
     entropy: float = 0.01
     """Weight of the entropy bonus, with ``ppo``."""
     value_warmup: int = 2
-    """First iterations, of more, that train the value head alone."""
+    """First iterations, of more, that train the critic alone."""
     grad_clip: float = 1.0
     """Largest norm of the gradient."""
     select_every: int = 0

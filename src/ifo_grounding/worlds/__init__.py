@@ -1,6 +1,6 @@
 """Worlds that recipes run in: the library's own, BabyAI, any of Gymnasium, or a person's own class.
 
-A recipe knows :class:`World` alone, so that every recipe runs on every world.
+A recipe knows :class:`World` alone, so that both phases run on every world.
 """
 
 from ifo_grounding.worlds.babyai import BabyAI
