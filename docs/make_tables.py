@@ -55,10 +55,13 @@ def gain_of_paper(before: Rate, after: Rate) -> str:
 
 def table_2(task: str) -> Row:
     first, *later = TABLE_2[task]
-    row = {"the paper, 1": brief(of_paper(first)), "the paper, best 2": brief(of_paper(max(later)))}
+    row = {
+        "published, phase 1": brief(of_paper(first)),
+        "published, best phase 2": brief(of_paper(max(later))),
+    }
     for preset in PRESETS:
         runs = pieces().get((task, preset, "pairs-5000"))
-        row |= {f"`{preset}`, {i}": success(runs, f"phase{i}") for i in (1, 2)}
+        row |= {f"`{preset}`, phase {i}": success(runs, f"phase{i}") for i in (1, 2)}
     return row
 
 
@@ -66,7 +69,7 @@ def gains(task: str) -> Row:
     found, row = pieces(), {}
     first, *later = map(of_paper, TABLE_2[task])
     for pairs, told in zip((5000, 10_000), later, strict=True):
-        row[f"the paper, {pairs:,} pairs"] = gain_of_paper(first, told)
+        row[f"published, {pairs:,} pairs"] = gain_of_paper(first, told)
         row[f"`paper`, {pairs:,} pairs"] = gain(found.get((task, "paper", f"pairs-{pairs}")))
     row["paid for goals"] = gain(found.get((task, "paper", "goal-pairs-5000")))
     control = found.get((task, "paper", "goal-continued"))
@@ -75,7 +78,7 @@ def gains(task: str) -> Row:
 
 
 def table_3(task: str) -> Row:
-    row = {"the paper": f"{TABLE_3[task]:.1f}%"}
+    row = {"published": f"{TABLE_3[task]:.1f}%"}
     for preset in PRESETS:
         runs = pieces()[task, preset, "phase-1"]
         shares = [run["results"]["suitability"]["rate"]["rate"] for run in runs]
@@ -87,7 +90,7 @@ def table_3(task: str) -> Row:
 
 def zero_shot(task: str) -> Row:
     """Return Table 4: success after phase 1 on pairs held out from instructions, and on others."""
-    row = {"the paper, 1 / 2": "{}% / {}%".format(*TABLE_4[task])}
+    row = {"published, phase 1 / 2": "{}% / {}%".format(*TABLE_4[task])}
     for preset in PRESETS:
         runs = pieces()[task, preset, "zero-shot"]
         both = f"{success(runs, 'phase1')} / {percent(map(of_trained, runs))}"
