@@ -6,12 +6,12 @@ import atexit
 import contextlib
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.utils import instantiate
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl import torchrl_logger
 
@@ -39,8 +39,14 @@ REWARD = "reward.safetensors"
 GOAL = "goal.safetensors"
 VALUE = "value.safetensors"
 PAIRS = "pairs"
-CHECKSUMS = "networks.json"
-"""Of the networks that the run has trained, by file."""
+MADE_BY = {
+    **{INVERSE: ["train_inverse"], REWARD: ["train_reward"], GOAL: ["train_goal"]},
+    **{CLASSIFIER: ["train_instruction"], POLICIES["phase1"]: ["imitate"]},
+    **{POLICIES["phase2"]: ["self_examine"], VALUE: ["self_examine"]},
+    **{REFERENCE: ["baselines", "imitate_truth"], CONTINUED: ["controls", "continue_imitation"]},
+}
+"""The recipe that trains each network, and its stage where that has another name."""
+CHECKSUMS = "networks.json"  # of the networks that the run has trained, by file
 OF_PHASE_2 = (
     *("self_examine", "continue_imitation", "evaluate"),
     *(POLICIES["phase2"], CONTINUED, VALUE, PAIRS),
@@ -68,11 +74,7 @@ def open_run(options: Options, stage: str = "") -> Run:
     """Return the run of these options, which it is made with from now on.
 
     A new one takes over what its ``base`` has made, but for phase 2. One that a command makes
-    nothing of is removed as the command ends.
-
-    Args:
-        options: of the command.
-        stage: what is done next; what it needs has to be there.
+    nothing of is removed as the command ends. What ``stage``, done next, needs has to be there.
 
     Raises:
         UserError: where it was made with other options.
@@ -220,8 +222,6 @@ def finish(options: Options, stage: Stage, result: dict[str, Any], history: Any 
 
 def read_fast(buffer: Any, options: Options) -> None:
     """Let a buffer give codes of the simulator's, where it has them, and keep frames on a GPU."""
-    if getattr(buffer, "transform", None) is None:
-        return
     if (tiles := world_of(options).tiles) is not None:
         show_codes(buffer, tiles)
     parts = [part for part in buffer.transform.modules() if isinstance(part, FrameDecoder)]
@@ -240,18 +240,21 @@ def save_network(run: Run, name: str, network: Any) -> None:
     write_json(run / CHECKSUMS, {**checksums(run), name: networks.save(network, run / name)})
 
 
-def load_network(
-    run: Run, name: str, recipe: str, options: Options, stage: str | None = None
-) -> TensorDictModuleBase:
+def load_network(run: Run, name: str, options: Options, made_by: Sequence[str] = ()) -> Any:
     """Load a network that an earlier recipe trained; another run's is refused."""
-    path, checksum = run.need(name, recipe, stage), checksums(run).get(name)
+    path, checksum = run.need(name, *made_by or MADE_BY[name]), checksums(run).get(name)
     network = networks.load(path, device=options.device, checksum=checksum)
     return reading_codes(network, options)
 
 
+def load_there(run: Run, files: Mapping[str, str], options: Options) -> dict[str, Any]:
+    """Load the networks that a run has of these files, by their names."""
+    return {name: load_network(run, f, options) for name, f in files.items() if (run / f).exists()}
+
+
 def starting_policy(run: Run, options: Options, warm_start: bool) -> Any:
     """Return the phase-1 policy where a network is to begin with its weights, else None."""
-    return load_network(run, POLICIES["phase1"], "imitate", options) if warm_start else None
+    return load_network(run, POLICIES["phase1"], options) if warm_start else None
 
 
 def load_demonstrations(run: Run) -> Demonstrations:

@@ -33,6 +33,7 @@ from _shared import (
 from evaluate import measured_success, played, success_results
 from imitate import imitate_transitions, new_policy, split_transitions
 from self_examine import chosen_starts
+from torchrl.data import ReplayBufferEnsemble
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 from two_phase import stages_of
@@ -45,7 +46,6 @@ from ifo_grounding.baselines import (
     Adversary,
     ChosenAGILE,
     GAIfO,
-    HalfOfEach,
     SteppableActionDemonstrations,
     SteppableDemonstrations,
     steps_of_policy,
@@ -123,13 +123,10 @@ def trained(options: Options) -> Any:
         if stage.result is None:
             train = bco_alpha if method == "bco-alpha" else adversarial
             train(options, stage)
-    made = {
-        "bc": (REFERENCE, "imitate_truth"),
-        "bco": (POLICIES["phase1"], "imitate"),
-        "ours": (POLICIES["phase2"], "self_examine"),
-    }
-    file, by = made.get(method, (file_of(method), f"baseline_{method}"))
-    return load_network(run, file, "baselines", options, by)
+    made = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
+    if method in made:
+        return load_network(run, made[method], options)
+    return load_network(run, file_of(method), options, ("baselines", f"baseline_{method}"))
 
 
 def imitate_truth(options: Options) -> dict:
@@ -163,10 +160,12 @@ def file_of(method: str) -> str:
 def bco_alpha(options: Options, stage: Stage) -> None:
     """Imitate anew, with labels of an inverse model that has learned from the policy's steps."""
     run, world, section = stage.run, world_of(options), options.transitions
+    if (size := options.inverse.batch_size) % 2:
+        raise UserError(f"bco-alpha draws half of each batch: inverse.batch_size={size} is odd")
     demos = load_demonstrations(run)
     own = steps_of_policy(
         simulator_of(options, section.num_envs),
-        load_network(run, POLICIES["phase1"], "imitate", options),
+        load_network(run, POLICIES["phase1"], options),
         demos.pool(),
         math.ceil(options.baseline.alpha * section.n),
         stop_action=world.stop_action,
@@ -174,8 +173,8 @@ def bco_alpha(options: Options, stage: Stage) -> None:
         progress=options.progress,
     )
     random = Collected.load(run.need(TRANSITIONS, "collect_transitions"))
-    inverse = load_network(run, INVERSE, "train_inverse", options)
-    both: Any = HalfOfEach(random.buffer, own.buffer)
+    inverse = load_network(run, INVERSE, options)
+    both = ReplayBufferEnsemble(random.buffer, own.buffer, sample_from_all=True)  # half of each
     fit(InverseLoss(inverse), both, options.inverse, seed=options.seed, name=stage.name)
     _, report = label_demonstrations(demos, inverse, progress=options.progress)
     changed = float((report.actions != load_labels(run)).float().mean())
@@ -200,7 +199,7 @@ def planned(options: Options) -> LCRL:
         found = planner.learn(options.baseline.likelihood_steps, ROWS, options.seed)
         save_network(run, file, planner.network)
         finish(options, stage, {"of": plain(options.baseline), **found})
-    trained = load_network(run, file, "baselines", options, stage.name)
+    trained = load_network(run, file, options, ("baselines", stage.name))
     planner.network.load_state_dict(trained.state_dict())
     return planner
 
@@ -222,12 +221,12 @@ def adversarial(options: Options, stage: Stage) -> None:
     run, world = stage.run, world_of(options)
     begun = None
     if method == "gail+bc":
-        begun = load_network(run, REFERENCE, "baselines", options, "imitate_truth")
+        begun = load_network(run, REFERENCE, options)
     policy = new_policy(options, options.seed) if begun is None else begun
     value = build(make_value, options, init_from=policy)
     seen, more = access(options, run), options.networks.changed()
     if method == "gaifo":
-        more["inverse"] = load_network(run, INVERSE, "train_inverse", options)
+        more["inverse"] = load_network(run, INVERSE, options)
     adversary = ADVERSARIES[method](
         seen,
         options.preset,

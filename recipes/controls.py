@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from _shared import CONTINUED, POLICIES, learn, load_network, open_stage, tell
 from imitate import labelled_demonstrations
-from self_examine import adversarial_updates, held_out_accuracy, learned_reward, paid_simulator
+from self_examine import held_out_accuracy, learned_reward, paid_simulator, trains_reward
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
@@ -19,7 +19,7 @@ def continue_imitation(options: Options) -> dict:
     if stage.result is not None:
         return stage.result
     run = stage.run
-    policy = load_network(run, POLICIES["phase1"], "imitate", options)
+    policy = load_network(run, POLICIES["phase1"], options)
     seen, aside = labelled_demonstrations(run, options.imitate.held_out)
     steps, batch = matched_steps(options), section.minibatch
     config = replace(options.imitate, steps=steps, batch_size=batch, lr=options.controls.lr)
@@ -34,7 +34,7 @@ def continue_imitation(options: Options) -> dict:
             max_steps=section.max_steps,
             margin=section.select_margin,
             held_out=held_out_accuracy(policy, aside, run, options),
-            by_accuracy=adversarial_updates(reward, run, options) is not None,
+            by_accuracy=trains_reward(section),
         )
         best.measure()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)

@@ -14,6 +14,7 @@ from _shared import (
     finish,
     load_demonstrations,
     load_network,
+    load_there,
     open_stage,
     plain,
     world_of,
@@ -65,7 +66,7 @@ def evaluate(options: Options) -> dict:
     # Each part is reported if the run has it, so that phase 1 can be evaluated alone.
     labels = run.record("label").get("result", {}).get("accuracy")
     results: dict[str, Any] = {"labels": labels} if labels else {}
-    policies = {name: load_network(run, NAMES[name], "imitate", options) for name in there}
+    policies = load_there(run, NAMES, options)
     measured = measured_success(policies, options)
     results |= success_results(measured)
     if "phase2" in measured:
@@ -128,7 +129,7 @@ def evaluate_truth(policies: dict[str, Any], run: Run, options: Options) -> dict
         if len(ends) > 1 and name == "endings":
             results["changes"] = compare_endings(*ends.values())
     if options.evaluate.states and (run / CLASSIFIER).exists():
-        classifier = load_network(run, CLASSIFIER, "train_instruction", options)
+        classifier = load_network(run, CLASSIFIER, options)
         pool, states = load_demonstrations(run).pool(), options.evaluate.states
         chosen = {**chosen_by(options), **scenes}
         results["suitability"] = oracle.suitable_rate(
@@ -143,7 +144,7 @@ def evaluate_rewards(policy: Any, run: Run, options: Options) -> dict[str, Any]:
     world, scenes = world_of(options), evaluation_scenes(options)
     env, shown = played(options, options.evaluate.audit_episodes, waits=True)
     if (run / REWARD).exists():
-        model = load_network(run, REWARD, "train_reward", options)
+        model = load_network(run, REWARD, options)
         if world.oracle is not None:
             demos, truth = world.demonstrate(HELD_OUT, seed=scenes["seed"], stream=scenes["stream"])
             assert truth is not None
@@ -151,7 +152,7 @@ def evaluate_rewards(policy: Any, run: Run, options: Options) -> dict[str, Any]:
         audit = return_audit(policy, LearnedReward(model), env, average=True, **shown)
         results["action_return"] = audit.as_dict()
     if (run / GOAL).exists():
-        classifier = load_network(run, GOAL, "train_goal", options)
+        classifier = load_network(run, GOAL, options)
         reward = GoalReward(classifier, stop_action=world.stop_action)
         results["goal_return"] = return_audit(policy, reward, env, **shown).as_dict()
     return results
@@ -168,7 +169,7 @@ def audit_callback(
     fixed: dict[str, Any] = {}  # the classifier does not change, nor do the expert's actions
     if world.oracle is not None:
         chosen = world.oracle.suitable_rate(
-            load_network(run, CLASSIFIER, "train_instruction", options),
+            load_network(run, CLASSIFIER, options),
             load_demonstrations(run).pool(),
             states=section.audit_episodes,
             pairs_per_state=0,

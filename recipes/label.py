@@ -25,7 +25,7 @@ def label(options: Options) -> dict:
     if stage.result is not None:
         return stage.result
     demos = load_demonstrations(stage.run)
-    inverse = load_network(stage.run, INVERSE, "train_inverse", options)
+    inverse = load_network(stage.run, INVERSE, options)
     _, report = label_demonstrations(demos, inverse, progress=options.progress)
     report.save(stage.run / LABELS)
     found: dict[str, Any] = {"confidence": report.summary()}

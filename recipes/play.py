@@ -17,7 +17,7 @@ from _shared import (
     POLICIES,
     VALUE,
     load_demonstrations,
-    load_network,
+    load_there,
     world_of,
 )
 from hydra.core.config_store import ConfigStore
@@ -113,14 +113,10 @@ def load(name: str) -> Agent:
         raise UserError(f"there is no run {name} ({run.folder}): ifo-grounding demo makes one")
     made = options_of(f"run={name}")
     run.need(POLICIES["phase1"], "imitate")
-
-    def there(**files: str) -> dict[str, Any]:
-        found = {kind: file for kind, file in files.items() if (run / file).exists()}
-        return {kind: load_network(run, file, "imitate", made) for kind, file in found.items()}
-
     phases = dict(zip(("imitation", "self-examination"), POLICIES.values(), strict=True))
-    others = there(instruction=CLASSIFIER, goal=GOAL, value=VALUE, inverse=INVERSE)
-    agent = Agent(world_of(made), there(**phases), load_demonstrations(run).pool(), **others)
+    others = {"instruction": CLASSIFIER, "goal": GOAL, "value": VALUE, "inverse": INVERSE}
+    policies, others = (load_there(run, files, made) for files in (phases, others))
+    agent = Agent(world_of(made), policies, load_demonstrations(run).pool(), **others)
     return agent if agent.arranges else replace(agent, teach=taught_in(made.world))
 
 

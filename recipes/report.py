@@ -13,6 +13,7 @@ from _shared import (
     command,
     load_demonstrations,
     load_network,
+    load_there,
     open_run,
     world_of,
 )
@@ -82,7 +83,7 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     results = evaluate(options) if results is None else results
     pictures: dict[str, Any] = episode_pictures(run, options, results)
     if "suitability" in results:
-        classifier = load_network(run, CLASSIFIER, "train_instruction", options)
+        classifier = load_network(run, CLASSIFIER, options)
         oracle, pool = world_of(options).oracle, load_demonstrations(run).pool()
         assert oracle is not None
         shown: Any = {"states": 512, "pairs_per_state": 0, "stream": "validation"}
@@ -125,7 +126,7 @@ def recorded(policy: Any, scenes: list[int], options: Options, tile_size: int | 
 def episode_pictures(run: Run, options: Options, results: dict[str, Any]) -> dict[str, Any]:
     """Animate episodes: scenes that phase 2 gained and lost, or some of the last policy."""
     names = [name for name in POLICIES if name in results]
-    policies = [load_network(run, POLICIES[name], "imitate", options) for name in names]
+    policies = [load_network(run, POLICIES[name], options) for name in names]
     drawn = {"actions": world_of(options).actions}
     episodes = recorded(policies[-1], list(range(EPISODES)), options, TILE_SIZE)
     some = {f"Episodes of phase {len(policies)}": animation(episodes, columns=EPISODES, **drawn)}
@@ -150,11 +151,7 @@ def episode_pictures(run: Run, options: Options, results: dict[str, Any]) -> dic
 
 def step_by_step(policy: Any, scenes: list[int], run: Run, options: Options) -> dict[str, bytes]:
     """Animate episodes with action probabilities, learned rewards and attention."""
-    rewards = {
-        name: load_network(run, file, "two_phase", options)
-        for name, file in (("action", REWARD), ("goal", GOAL))
-        if (run / file).exists()
-    }
+    rewards = load_there(run, {"action": REWARD, "goal": GOAL}, options)
     words, found = load_demonstrations(run).vocabulary, {}
     for episode in recorded(policy, scenes, options, None):
         trace = trace_episode(policy, episode, rewards, vocabulary=words)

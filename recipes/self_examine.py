@@ -33,7 +33,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from ifo_grounding.cli import recipe_main
-from ifo_grounding.config import Options
+from ifo_grounding.config import Options, SelfExamineConfig
 from ifo_grounding.data import labelled_buffer
 from ifo_grounding.data.folder import load_folder, save_folder
 from ifo_grounding.keys import INSTRUCTION, SCENE
@@ -60,7 +60,7 @@ def examine(options: Options) -> dict:
         return stage.result
     run = stage.run
     # What is trained: the policy of phase 1, and a critic that begins with its weights.
-    policy = load_network(run, POLICIES["phase1"], "imitate", options)
+    policy = load_network(run, POLICIES["phase1"], options)
     value = build(make_value, options, init_from=policy)
     # Where: states of the simulator with chosen instructions, paid by what was learned.
     reward = learned_reward(run, options)
@@ -118,8 +118,8 @@ def remote_simulators(run: Run, options: Options) -> list[Callable[[], EnvBase]]
 def learned_reward(run: Run, options: Options) -> LearnedReward | GoalReward:
     """Return the paper's reward of actions, or the reward of reached goals."""
     if options.self_examine.reward == "action":
-        return LearnedReward(load_network(run, REWARD, "train_reward", options))
-    classifier = load_network(run, GOAL, "train_goal", options)
+        return LearnedReward(load_network(run, REWARD, options))
+    classifier = load_network(run, GOAL, options)
     return GoalReward(classifier, stop_action=world_of(options).stop_action)
 
 
@@ -128,7 +128,7 @@ def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPa
 
     Pairs are kept in the run, for where the search is long: some tasks suit one state in seventy.
     """
-    classifier = load_network(run, CLASSIFIER, "train_instruction", options)
+    classifier = load_network(run, CLASSIFIER, options)
     pool, section = load_demonstrations(run).pool(), options.self_examine
     if section.pairs is None:
         return InstructionSampler(classifier, pool, **chosen_by(options))
@@ -151,10 +151,15 @@ def chosen_starts(run: Run, options: Options) -> InstructionSampler | StartingPa
     return StartingPairs(pairs)
 
 
+def trains_reward(section: SelfExamineConfig) -> bool:
+    """Whether the reward model is trained on."""
+    return section.reward == "action" and section.reward_steps > 0
+
+
 def adversarial_updates(reward: Any, run: Run, options: Options) -> AdversarialUpdates | None:
     """Return what trains the reward model on, with the policy's actions as negatives."""
     section = options.self_examine
-    if section.reward != "action" or not section.reward_steps:
+    if not trains_reward(section):
         return None
     demos = labelled_buffer(load_demonstrations(run), load_labels(run))
     loss = RewardLoss(reward.model)
@@ -170,8 +175,7 @@ def held_out_accuracy(
     trained on, they are the first of those that are imitated.
     """
     section = options.self_examine
-    trained_on = section.reward == "action" and section.reward_steps
-    if aside is None and section.select_every and trained_on:
+    if aside is None and section.select_every and trains_reward(section):
         demos = load_demonstrations(run)[: section.select_episodes]
         aside = labelled_buffer(demos, load_labels(run)[: demos.transitions])
     return HeldOutAccuracy(policy, aside) if aside is not None else None

@@ -27,7 +27,7 @@ def share(options: Options) -> list[Path]:
     for name, files in FILES.items():
         there = [file for file in files if (run / file).exists()]
         if there:
-            network = load_network(run, there[0], "two_phase", options)
+            network = load_network(run, there[0], options)
             hub_id = f"{options.hub}-{name}" if options.hub else None
             folder = Path(options.to) / name
             written.append(save_pretrained(network, folder, facts=facts, hub_id=hub_id))

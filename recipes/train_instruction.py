@@ -51,7 +51,7 @@ def losses(
 ) -> list[InstructionLoss]:
     """Return the loss of each trial: the last one begins without the policy's roles of words."""
     section, pool = options.instruction, demos.pool()
-    policy = load_network(run, POLICIES["phase1"], "imitate", options)
+    policy = load_network(run, POLICIES["phase1"], options)
     likely = [(True, trial_seed(options.seed, number)) for number in range(section.trials - 1)]
     return [
         InstructionLoss(

@@ -51,6 +51,16 @@ def as_words(pixels: Tensor) -> Tensor:
     return row.view(torch.int64)
 
 
+def cut(pictures: Tensor, height: int, width: int) -> Tensor:
+    """Cut pictures, [N, C, H, W], into tiles [N, H / height, W / width, C * height * width].
+
+    >>> cut(torch.arange(4).view(1, 1, 2, 2), 1, 2).tolist()
+    [[[[0, 1]], [[2, 3]]]]
+    """
+    tiles = pictures.unflatten(-1, (-1, width)).unflatten(-3, (-1, height))
+    return tiles.permute(0, 2, 4, 1, 3, 5).flatten(3)
+
+
 def assemble(table: Tensor, index: Tensor) -> Tensor:
     """Lay tiles side by side.
 

@@ -126,7 +126,7 @@ def test_options_replace_values_and_other_options_or_networks_nothing(options, p
     other = networks.make_inverse(networks.Shapes((3, 8, 8), 9))
     networks.save(other, phase_1 / "inverse.safetensors")  # of another run
     with pytest.raises(UserError, match="not what was saved"):
-        load_network(open_run(options()), "inverse.safetensors", "train_inverse", options())
+        load_network(open_run(options()), "inverse.safetensors", options())
 
 
 def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, phase_1):
@@ -202,7 +202,7 @@ def test_the_instruction_classifier_tries_the_policys_roles_and_sees_fresh_state
     given = options("task=pick", "instruction.fresh_states=301", "instruction.trials=3")
     make_stages(given, until="imitate")
     run = open_run(given)
-    policy = load_network(run, "policy-phase1.safetensors", "imitate", given)
+    policy = load_network(run, "policy-phase1.safetensors", given)
     tried = losses(given, run, load_demonstrations(run), None)
     theirs, *own = (
         next(part for part in each.modules() if isinstance(part, networks.grounding.WordMaps))
@@ -226,7 +226,7 @@ def test_the_own_world_is_learned_from_in_codes_of_one_simulator(options):
     given = options("task=pick")
     make_stages(given, until="imitate")
     run, simulator = open_run(given), coded_simulator(given, 3)
-    policy = load_network(run, "policy-phase1.safetensors", "imitate", given)
+    policy = load_network(run, "policy-phase1.safetensors", given)
     seen, _ = labelled_demonstrations(run, 0.0)
     pixels = seen[:]["pixels"]
     expected = policy(seen[:])["logits"]

@@ -19,7 +19,7 @@ from ifo_grounding.baselines.adversarial import (
     DiscriminatorReward,
     GAIfO,
 )
-from ifo_grounding.baselines.bco import HalfOfEach, steps_of_policy
+from ifo_grounding.baselines.bco import steps_of_policy
 from ifo_grounding.baselines.lc_rl import LCRL
 
 __all__ = [
@@ -33,7 +33,6 @@ __all__ = [
     "DiscriminatorLoss",
     "DiscriminatorReward",
     "GAIfO",
-    "HalfOfEach",
     "SteppableActionDemonstrations",
     "SteppableDemonstrations",
     "steps_of_policy",

@@ -5,39 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv
 
 from ifo_grounding import keys
 from ifo_grounding.data import Collected, collect_transitions
 from ifo_grounding.transforms import InstructionSampler
-
-
-class HalfOfEach:
-    """Two replay buffers, from each of which comes half of what is sampled.
-
-    >>> class Ones:
-    ...     def __len__(self): return 3
-    ...     def sample(self, batch_size): return torch.ones(batch_size)
-    >>> both = HalfOfEach(Ones(), Ones())
-    >>> len(both), both.sample(5).shape
-    (6, torch.Size([5]))
-    """
-
-    def __init__(self, first: ReplayBuffer, second: ReplayBuffer) -> None:
-        self.first, self.second = first, second
-
-    def __len__(self) -> int:
-        return len(self.first) + len(self.second)
-
-    def sample(self, batch_size: int) -> TensorDictBase:
-        """Draw from both, [batch_size]."""
-        parts = self.first.sample(batch_size - batch_size // 2), self.second.sample(batch_size // 2)
-        both: TensorDictBase = torch.cat(parts)
-        return both
 
 
 def steps_of_policy(env: EnvBase, policy: Any, pool: Tensor, n: int, **options: Any) -> Collected:

@@ -207,7 +207,9 @@ class FrameCodec:
         parts = []
         frames = frames.cpu().reshape(-1, *self.image_shape)  # strides as words need them
         for piece in frames.split(max(1, CHUNK_BYTES // math.prod(self.image_shape))):
-            numbers = self._number(_cut(piece, self.tile_size))
+            across = self.tile_size // mosaic.PIXELS_PER_WORD
+            tiles = mosaic.cut(mosaic.as_words(piece), self.tile_size, across)
+            numbers = self._number(tiles.flatten(0, 2))
             parts.append(numbers.to(self.code_dtype))
         return join(parts, self.code_dtype).view(-1, *self.code_shape)
 
@@ -245,15 +247,6 @@ class FrameCodec:
     def _give_up(self, codes: Spool) -> tuple[FrameCodec, Spool]:
         """Turn codes back into pixels and return them with a raw codec."""
         return FrameCodec(self.image_shape), codes.map(self.decode)
-
-
-def _cut(frames: Tensor, tile_size: int) -> Tensor:
-    """Cut frames, uint8 [F, C, H, W], into tiles as words, int64 [F * rows * columns, K]."""
-    count, channels, height, width = frames.shape
-    words = mosaic.as_words(frames)
-    across = tile_size // mosaic.PIXELS_PER_WORD
-    grid = (count, channels, height // tile_size, tile_size, width // tile_size, across)
-    return words.view(grid).permute(0, 2, 4, 1, 3, 5).reshape(-1, channels * tile_size * across)
 
 
 def _checked(frames: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ifo_grounding.distinct import distinct_rows, places_of
 from ifo_grounding.errors import UserError
 from ifo_grounding.mosaic import PIXELS_PER_WORD as WORD
-from ifo_grounding.mosaic import as_words, assemble
+from ifo_grounding.mosaic import as_words, assemble, cut
 from ifo_grounding.networks.cells import distinct_pairs
 
 FEWEST_WINDOWS = 1 << 12
@@ -107,24 +107,18 @@ def _distinct_cells(image: Tensor, patch: int) -> tuple[Tensor, Tensor]:
     below, right = (-size % patch for size in image.shape[-2:])
     image = F.pad(image, (0, right, 0, below)) if below or right else image
     if is_plain(image) and not patch % WORD:
-        cut = _cut(as_words(image), patch, patch // WORD)
-        rows, index = distinct_rows(cut.flatten(0, 2))
+        words = cut(as_words(image), patch, patch // WORD)
+        rows, index = distinct_rows(words.flatten(0, 2))
         if 2 * len(rows) <= len(index):
             cells = rows.view(torch.uint8).unflatten(1, (-1, patch**2))
-            return cells, index.view(cut.shape[:3]).flatten(1)
-    cut = _cut(image, patch, patch)
-    index = torch.arange(cut[..., 0].numel(), device=image.device)
-    cells = cut.flatten(0, 2).unflatten(1, (-1, patch**2))
-    return cells, index.view(cut.shape[:3]).flatten(1)
+            return cells, index.view(words.shape[:3]).flatten(1)
+    pixels = cut(image, patch, patch)
+    index = torch.arange(pixels[..., 0].numel(), device=image.device)
+    cells = pixels.flatten(0, 2).unflatten(1, (-1, patch**2))
+    return cells, index.view(pixels.shape[:3]).flatten(1)
 
 
 _remembered_cells = remembered(_distinct_cells)
-
-
-def _cut(image: Tensor, height: int, width: int) -> Tensor:
-    """Cut [N, C, H, W] into [N, h, w, C * height * width]."""
-    cells = image.unflatten(-1, (-1, width)).unflatten(-3, (-1, height))
-    return cells.permute(0, 2, 4, 1, 3, 5).flatten(3)
 
 
 class Mosaics(NamedTuple):

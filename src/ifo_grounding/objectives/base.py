@@ -64,10 +64,7 @@ class SupervisedLoss(LossModule):
 
     @property
     def capturable(self) -> bool:
-        """Whether all training steps do the same, and one can be captured as a CUDA graph.
-
-        They do not where a network looks at which words a batch says.
-        """
+        """Whether all training steps do the same, and one can be captured as a CUDA graph."""
         return not has_word_penalty(self.network)
 
     @property
