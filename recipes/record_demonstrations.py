@@ -4,6 +4,8 @@ from _shared import DEMONSTRATIONS, TRUTH, finish, open_stage, tell, world_of
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
+from ifo_grounding.errors import UserError
+from ifo_grounding.worlds import World
 
 
 def record(options: Options) -> dict:
@@ -15,11 +17,29 @@ def record(options: Options) -> dict:
         demos, truth = world.read(options.recorded, progress=options.progress)[:n], None
     else:
         demos, truth = world.demonstrate(n, seed=options.seed, progress=options.progress)
+    if world.rewarded:
+        world.vocabulary = world.vocabulary or demos.vocabulary
+        try_out(world, options.seed)
     if truth is not None:
         truth.save(stage.run / TRUTH)
     demos.save(stage.run / DEMONSTRATIONS)
     counts = {"demonstrations": len(demos), "transitions": demos.transitions}
     return finish(options, stage, {**counts, "instructions": len(demos.pool())})
+
+
+def try_out(world: World, seed: int) -> None:
+    """Begin an instructed episode, so that what is wrong with sentences is said before training.
+
+    Raises:
+        UserError: where none can begin, or the names of actions are not as many as the actions.
+    """
+    env = world.instructed(1, seed=seed, stream="validation")
+    env.reset()
+    count = getattr(env.action_spec, "n", None)
+    if world.actions and count not in (None, len(world.actions)):
+        raise UserError(
+            f"there are {count} actions and {len(world.actions)} names: name all of them"
+        )
 
 
 @recipe_main

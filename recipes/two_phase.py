@@ -86,7 +86,10 @@ def phase_1_alone(options: Options) -> str | None:
         return "all demonstrations are cut short, so that no frame shows a goal that was reached"
     never_stops = by_goal and world_of(options).stop_action is None
     if never_stops and isinstance(untransformed(simulator_of(options)), GymnasiumEnv):
-        return "the world has no stop, at which the goal reward is paid: give world.stop=add"
+        return (
+            "the world has no stop, at which the goal reward is paid: give the action that ends an "
+            "episode (world.stop=2), or add one where none does (world.stop=add)"
+        )
     return None
 
 

@@ -15,6 +15,7 @@ from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
 from ifo_grounding.playground import Lesson
+from ifo_grounding.training import Run
 from ifo_grounding.worlds import BabyAI, Grid, OpenGrid, World
 
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
@@ -55,6 +56,23 @@ def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
     policy = networks.load(tmp_path / "run" / "policy-phase2.safetensors")
     assert policy.network_config.shapes.n_actions == 3 and "dial" in policy.vocabulary.words
     assert world[0] == "world=gymnasium" or "dial" in report(given).read_text()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error"),
+    [
+        (["world.instruction=sentence"], "there is no instruction 'sentence'"),
+        (["world.instruction=task", "world.names=[left,right]"], "3 actions and 2 names"),
+    ],
+)
+def test_what_is_wrong_with_a_world_is_said_before_anything_is_kept(options, dial, wrong, error):
+    from record_demonstrations import record
+
+    world = ["world=gymnasium", "world.factory=own_dial.Dial", "world.image=view", "world.stop=2"]
+    given = options(dial, *world, *TURN, *wrong)
+    with pytest.raises(UserError, match=error):
+        record(given)
+    assert not (Run(given.run) / "demonstrations").exists()
 
 
 class Dimmed(Grid):

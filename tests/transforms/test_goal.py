@@ -3,8 +3,9 @@
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.envs import check_env_specs
+from torchrl.envs import TransformedEnv, check_env_specs
 
+from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.transforms import GoalReward
 from transforms.counter_world import (
@@ -113,3 +114,10 @@ def test_what_does_not_fit_is_refused():
         GoalReward(unnamed, STOP)
     with pytest.raises(UserError, match=r"needs the entry 'initial_pixels'.*on the environment"):
         goal()(make().rollout(5))
+
+
+def test_the_stop_is_that_of_the_environment():
+    world = PickAndPlaceEnv("move", num_envs=2, seed=0)
+    assert "learned_reward" in TransformedEnv(world, goal(world.stop_action)).full_reward_spec
+    with pytest.raises(UserError, match=r"stop_action=4 does not end .* is 5"):
+        TransformedEnv(world, goal(4)).full_reward_spec  # noqa: B018

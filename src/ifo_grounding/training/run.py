@@ -61,10 +61,8 @@ class Run:
     >>> import tempfile
     >>> run = Run(tempfile.mkdtemp())
     >>> run.begin({"count": {"to": 3}})
-    >>> run.stage("count").finish({"counted": 3})
-    {'counted': 3}
-    >>> run.stage("count").result
-    {'counted': 3}
+    >>> run.stage("count").finish({"counted": 3}) == run.stage("count").result
+    True
     """
 
     def __init__(self, name: str | Path, logger: str = "csv") -> None:
@@ -158,12 +156,15 @@ class Run:
             free: dotted names, of options or of whole sections, that may differ from before.
 
         Raises:
-            UserError: where the run was made with another value, or its file is damaged.
+            UserError: where the run was made with another value, or holds other files.
         """
         from omegaconf import OmegaConf
 
         made = self.options()
+        free = {*free} - {"base"} if options.get("base") else free  # nothing is taken over later on
         if made is None:
+            if any(self.folder.glob("[!.]*")) and not (self / "stages").is_dir():
+                raise UserError(f"{self.folder} holds other files and no run: name another run")
             with atomic_write(self / OPTIONS) as temporary:
                 OmegaConf.save(OmegaConf.create(options), temporary)
         elif found := difference(made, options, free):

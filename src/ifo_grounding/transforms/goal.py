@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite
 
+from ifo_grounding.attributes import attribute
 from ifo_grounding.errors import UserError, whole
 from ifo_grounding.keys import ACTION, GOAL_SCORE, INITIAL_PIXELS, PIXELS
 from ifo_grounding.transforms.base import rows_of
@@ -130,6 +131,12 @@ class GoalReward(RewardTransform):
                 raise UserError(
                     f"stop_action={self.stop_action} is no action of the environment, whose "
                     f"actions are 0..{count - 1}"
+                )
+            own = attribute(self.container, "stop_action")
+            if own not in (None, self.stop_action):
+                raise UserError(
+                    f"stop_action={self.stop_action} does not end an episode of this environment: "
+                    f"its own stop_action is {own}"
                 )
         return super().transform_reward_spec(reward_spec)
 
