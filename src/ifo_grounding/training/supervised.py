@@ -133,7 +133,7 @@ def fit(
     if not callable(getattr(buffer, "sample", None)):
         raise UserError(
             f"fit samples from a replay buffer, got {type(buffer).__name__}: demonstrations become "
-            "one by label_demonstrations(demos, inverse).buffer"
+            "one by labelled_buffer(demos, label_demonstrations(demos, inverse).report.actions)"
         )
     device = device_of(loss) or torch.device("cpu")
     if device.type != "cpu":
