@@ -94,9 +94,9 @@ def open_run(options: Options, stage: str = "") -> Run:
     if options.base:
         base = Run(options.base)
         if is_new and base.options() is not None:
-            base.begin({**plain(options), "base": None}, [*FREE, *CHOSEN_ANEW])
+            base.begin(plain(options), [*FREE, *CHOSEN_ANEW])
         run.take_over(base, without=OF_PHASE_2)
-    run.begin(plain(options), FREE)
+    run.begin(plain(options), {*FREE} - {"base"} if options.base else FREE)  # taken over at first
     return run
 
 

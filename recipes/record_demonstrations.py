@@ -4,7 +4,7 @@ from _shared import DEMONSTRATIONS, TRUTH, finish, open_stage, tell, world_of
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import check_names_of_actions
 from ifo_grounding.worlds import World
 
 
@@ -35,11 +35,8 @@ def try_out(world: World, seed: int) -> None:
     """
     env = world.instructed(1, seed=seed, stream="validation")
     env.reset()
-    count = getattr(env.action_spec, "n", None)
-    if world.actions and count not in (None, len(world.actions)):
-        raise UserError(
-            f"there are {count} actions and {len(world.actions)} names: name all of them"
-        )
+    if world.actions and hasattr(env.action_spec, "n"):
+        check_names_of_actions(world.actions, env.action_spec.n)
 
 
 @recipe_main

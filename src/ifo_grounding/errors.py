@@ -7,7 +7,7 @@ import difflib
 import importlib
 import math
 import operator
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -152,3 +152,9 @@ def optional(module: str, extra: str) -> Any:
 def first_line(error: Exception) -> str:
     """Return an error's kind and the first line of what it says."""
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
+
+
+def check_names_of_actions(names: Sequence[str], count: int) -> None:
+    """Refuse names of actions that are not one for each."""
+    if len(names) != count:
+        raise UserError(f"there are {count} actions and {len(names)} names: name each of them")

@@ -130,6 +130,7 @@ def test_options_replace_values_and_other_options_or_networks_nothing(options, p
 
 
 def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, phase_1):
+    from _shared import open_run
     from two_phase import two_phase
 
     base = f"base={phase_1}"
@@ -143,6 +144,10 @@ def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, 
     with pytest.raises(UserError, match="no finished stages"):
         two_phase(options(f"base={tmp_path / 'none'}", run="fourth"))
     assert not (tmp_path / "none").exists()
+    with pytest.raises(UserError, match=r"was made with base=null, not other"):
+        open_run(options("base=other"))  # a run that has begun takes nothing more over
+    open_run(options())
+    open_run(options(base, "self_examine.lr=1e-3", run="second"))
 
 
 def test_a_stage_without_what_it_needs_says_what_to_run(options, tmp_path, monkeypatch):

@@ -283,13 +283,8 @@ def test_a_run_of_which_nothing_came_leaves_nothing(tmp_path, first):
         assert each.folder.exists() == (each is first)
 
 
-def test_a_run_begins_in_a_folder_of_its_own_and_takes_over_nothing_later_on(tmp_path):
+def test_a_run_begins_in_a_folder_of_its_own(tmp_path):
     (tmp_path / "recordings").mkdir()
     (tmp_path / "recordings" / "codes.npy").touch()
     with pytest.raises(UserError, match="holds other files and no run"):
         Run(tmp_path / "recordings").begin({"n": 1})
-    run = Run(tmp_path / "run")
-    run.begin({"n": 1, "base": None}, free=["base"])
-    with pytest.raises(UserError, match=r"was made with base=null, not other"):
-        run.begin({"n": 1, "base": "other"}, free=["base"])
-    run.begin({"n": 1, "base": None}, free=["base"])

@@ -15,7 +15,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from ifo_grounding import keys
-from ifo_grounding.errors import UserError
+from ifo_grounding.errors import check_names_of_actions
 from ifo_grounding.evaluation.tracing import Trace
 from ifo_grounding.report.animation import gif
 from ifo_grounding.report.drawing import coloured
@@ -44,9 +44,7 @@ def trace_animation(trace: Trace, *, actions: Sequence[str] = keys.ACTIONS) -> b
     Raises:
         UserError: where there is not one name for each action.
     """
-    count = trace.probabilities.shape[-1]
-    if len(actions) != count:
-        raise UserError(f"there are {count} actions and {len(actions)} names: name each of them")
+    check_names_of_actions(actions, trace.probabilities.shape[-1])
     board = _Board(trace, sharpest(trace.maps, 8), [*map(one_line, actions)])
     end = len(trace.maps)
     return gif([board.picture(step) for step in range(max(0, end - 30), end)], fps=1.5)

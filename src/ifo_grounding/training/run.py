@@ -161,7 +161,6 @@ class Run:
         from omegaconf import OmegaConf
 
         made = self.options()
-        free = {*free} - {"base"} if options.get("base") else free  # nothing is taken over later on
         if made is None:
             if any(self.folder.glob("[!.]*")) and not (self / "stages").is_dir():
                 raise UserError(f"{self.folder} holds other files and no run: name another run")
