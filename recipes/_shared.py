@@ -113,10 +113,12 @@ def refuse_missing(run: Run, options: Options, stage: str) -> None:
         )
 
 
-def open_stage(options: Options, name: str) -> Stage:
-    """Return a stage of the run, and say whether it is done."""
+def open_stage(options: Options, name: str, of: Any = None) -> Stage:
+    """Return a stage of the run, done only if ``of`` these values, and say whether it is done."""
     release_freed_memory()  # of the stage before
     stage = open_run(options, name).stage(name)
+    if of is not None and stage.result and stage.result["of"] != of:
+        stage.result = None
     torch.set_num_threads(options.threads)
     if options.progress:
         tell_progress(name)
@@ -282,8 +284,7 @@ def result_file(options: Options) -> Path:
 
 def command(name: str) -> str:
     """Return the command of this process."""
-    given = [text for text in sys.argv[1:] if "=" in text]
-    return f"ifo-grounding {name} {shlex.join(given)}".strip()
+    return f"ifo-grounding {name} {shlex.join(w for w in sys.argv[1:] if '=' in w)}".strip()
 
 
 def write_result(options: Options, results: dict[str, Any], name: str) -> dict[str, Any]:
@@ -326,5 +327,4 @@ def tell(result: dict[str, Any]) -> None:
     """Print what a stage found, one line each."""
     from ifo_grounding.report import text_table
 
-    rows = [{"found": name.replace("_", " "), "value": value} for name, value in result.items()]
-    print(text_table(rows))
+    print(text_table([{"found": n.replace("_", " "), "value": v} for n, v in result.items()]))

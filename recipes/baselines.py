@@ -80,9 +80,9 @@ def baseline(options: Options) -> dict[str, Any]:
         if STAGES.index(name) <= STAGES.index(METHODS[options.method]):
             make(options)
     learned = trained(options)
-    stage = open_stage(options, f"evaluate_{options.method}")
     asked = {"options": plain(options.evaluate)}
-    if stage.result is not None and stage.result["of"] == asked:
+    stage = open_stage(options, f"evaluate_{options.method}", of=asked)
+    if stage.result is not None:
         return stage.result["results"]
     results = measured(learned, options)
     if curve := stage.run.metrics(f"baseline_{options.method}"):

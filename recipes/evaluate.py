@@ -15,6 +15,7 @@ from _shared import (
     load_demonstrations,
     load_network,
     load_there,
+    open_run,
     open_stage,
     plain,
     world_of,
@@ -50,11 +51,11 @@ SHOWN = 200
 
 
 def evaluate(options: Options) -> dict:
-    stage = open_stage(options, "evaluate")
-    run = stage.run
+    run = open_run(options, "evaluate")
     there = [name for name, file in NAMES.items() if (run / file).exists()]
     asked = {"policies": there, **plain(options.evaluate), **chosen_by(options)}
-    if stage.result is not None and stage.result.get("of") == asked:
+    stage = open_stage(options, "evaluate", of=asked)
+    if stage.result is not None:
         return stage.result["results"]
     run.need(POLICIES["phase1"], "imitate")
     if options.evaluate.split == "zero-shot" and options.world.get("split") != "train":
@@ -209,8 +210,7 @@ def audit_callback(
 @recipe_main
 def main(options: Options) -> dict:
     results = evaluate(options)
-    if options.results:
-        write_result(options, results, "evaluate")
+    write_result(options, results, "evaluate")
     print(text_table(results_rows(results)))
     return results
 

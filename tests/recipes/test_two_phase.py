@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ifo_grounding import networks
+from ifo_grounding.cli import main
 from ifo_grounding.config import STAGES
 from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.errors import UserError
@@ -164,6 +165,16 @@ def test_a_stage_without_what_it_needs_says_what_to_run(options, tmp_path, monke
     with pytest.raises(UserError, match=r"train_instruction, train_goal of .* until=train_goal"):
         examine(options())
     assert not (tmp_path / "run").exists()
+
+
+def test_other_scenes_are_measured_anew_and_kept(phase_1, capsys):
+    given = ["evaluate", f"run={phase_1}", "evaluate.mode=greedy"]
+    for episodes, said in (20, "running"), (10, "running"), (10, "done before"):
+        main([*given, f"evaluate.episodes={episodes}"])
+        assert f"evaluate: {said}\n" in capsys.readouterr().out
+        kept = read_json(phase_1 / "result.json")
+        assert kept["results"]["phase1"]["rate"]["count"] == episodes
+        assert kept["command"].endswith(f"evaluate.mode=greedy evaluate.episodes={episodes}")
 
 
 def test_a_run_until_its_labels_is_not_evaluated(options):
