@@ -19,7 +19,7 @@ from ifo_grounding.evaluation import success_rate
 from ifo_grounding.files import write_json
 from ifo_grounding.objectives import ImitationLoss
 from ifo_grounding.report import provenance
-from ifo_grounding.stats import paired_difference, two_level_bootstrap
+from ifo_grounding.stats import paired_difference, rate_over_seeds
 from ifo_grounding.training import FitConfig, fit
 
 CONFIG = FitConfig(steps=300, batch_size=256, lr=4e-3, iteration=25, warmup=0.1, weight_decay=0.01)
@@ -34,7 +34,7 @@ def main() -> None:
     content = {
         "provenance": provenance(),
         "found": found,
-        "success": [two_level_bootstrap(each).as_dict() for each in outcomes],
+        "success": [rate_over_seeds(each).as_dict() for each in outcomes],
         "difference": paired_difference(*reversed(outcomes)).as_dict(),
     }
     write_json(ROOT / "results" / "bench" / "curves.json", content)

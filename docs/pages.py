@@ -11,7 +11,7 @@ from typing import Any
 
 from ifo_grounding.files import read_json
 from ifo_grounding.report.results import brief, unpacked
-from ifo_grounding.stats import Difference, Rate, paired_difference, two_level_bootstrap
+from ifo_grounding.stats import Difference, Rate, paired_difference, rate_over_seeds
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "results"
@@ -56,7 +56,7 @@ def read(folder: str, key: Callable[[dict[str, Any]], Any]) -> dict[Any, Runs]:
 
 def rate(runs: Runs, name: str) -> Rate:
     """Return how often a policy succeeds, with an interval over seeds and scenes."""
-    return two_level_bootstrap(unpacked(runs, name))
+    return rate_over_seeds(unpacked(runs, name))
 
 
 def difference(runs: Runs, first: str, second: str) -> Difference:

@@ -11,12 +11,6 @@ from ifo_grounding import stats
 from ifo_grounding.errors import UserError
 
 
-@pytest.fixture
-def few_resamples(monkeypatch):
-    """P-values alone are asked for: bootstraps may be short."""
-    monkeypatch.setattr(stats.rates, "RESAMPLES", 10)
-
-
 def test_wilson_by_hand_and_of_nothing():
     # 8 of 10, z = 1.96: centre (0.8 + 0.19207) / 1.38415, half 1.96 / 1.38415 * sqrt(0.025604).
     rate = stats.wilson(8, 10)
@@ -36,7 +30,7 @@ def test_what_are_no_counts_no_table_no_probabilities_and_no_scores_is_refused()
             stats.wilson(successes, count)
     for table in ([], [[[1]]], [0.5, 1.0]):
         with pytest.raises(UserError, match="outcomes must be"):
-            stats.two_level_bootstrap(table)
+            stats.rate_over_seeds(table)
     for wrong in ([0.5], [0, 1]), ([1.2], [1]):
         with pytest.raises(UserError, match="reliability needs probabilities"):
             stats.reliability(*wrong)
@@ -57,34 +51,52 @@ def test_rate_reads_as_a_person_writes_it():
     assert str(stats.wilson(0, 100_000)) == "0.000% [0.000, 0.004] (n=100000)"
 
 
-def test_bootstrap_counts_the_spread_of_seeds():
-    # One seed fails always, one succeeds always: resampled means are 0, 1/2, 1 with 1/4, 1/2, 1/4.
+def test_a_rate_over_seeds_counts_their_spread():
+    # One seed fails always, one succeeds always: one half, with an error of one half, 1 and 12.7.
     outcomes = np.stack([np.zeros(500), np.ones(500)])
-    rate = stats.two_level_bootstrap(outcomes)
+    rate = stats.rate_over_seeds(outcomes)
     assert (rate.rate, rate.low, rate.high) == (0.5, 0.0, 1.0)
     assert (rate.successes, rate.count) == (500, 1000)
+    # Seeds of 50%, 60% and 70% on scenes of their own, which have nothing in common: the error is
+    # 0.1 / sqrt(3), the quantile of t with two degrees of freedom 4.303.
+    outcomes = np.zeros((3, 3000))
+    for seed, successes in enumerate((500, 600, 700)):
+        outcomes[seed, 1000 * seed : 1000 * seed + successes] = 1
+    rate = stats.rate_over_seeds(outcomes[:, :2700])
+    by_seed = np.array([500, 600, 700]) / 2700
+    half = 4.302653 * by_seed.std(ddof=1) / math.sqrt(3)
+    assert rate.high - rate.rate == pytest.approx(half) == pytest.approx(rate.rate - rate.low)
+
+
+def test_a_rate_of_one_seed_is_that_of_its_scenes():
+    rate = stats.rate_over_seeds(np.arange(10) < 8)
+    assert rate == stats.wilson(8, 10)
 
 
 def test_seeds_that_agree_on_every_scene_carry_no_more_than_one():
     scenes = np.arange(400) % 2 == 0
-    rate = stats.two_level_bootstrap(np.repeat(scenes[None], 10, axis=0))
-    assert rate.high - 0.5 == pytest.approx(1.96 * math.sqrt(0.25 / 400), abs=0.005)  # 0.049
+    rate = stats.rate_over_seeds(np.repeat(scenes[None], 10, axis=0))
+    assert rate.high - 0.5 == pytest.approx(2.262157 * math.sqrt(0.25 / 399))  # of nine: 0.057
     ones = np.ones((3, 100))
-    assert stats.two_level_bootstrap(ones).low == stats.wilson(100, 100).low < 1.0
+    assert stats.rate_over_seeds(ones).low == stats.wilson(100, 100).low < 1.0
 
 
-def test_bootstrap_draws_as_one_by_one_would():
-    # Drawing scenes by how often each pattern of outcomes occurs against drawing every scene.
-    rng = np.random.default_rng(2)
-    values = rng.random((3, 60)) < np.array([[0.5], [0.7], [0.9]])
-    means = []
-    for _ in range(10_000):
-        seed, scene = rng.integers(3, size=(3, 1)), rng.integers(60, size=(1, 60))
-        means.append(values[seed, scene].mean())
-    rate = stats.two_level_bootstrap(values)
-    low, high = np.quantile(means, (0.025, 0.975))
-    assert rate.low == pytest.approx(low, abs=0.012)  # two steps of 1 / 180
-    assert rate.high == pytest.approx(high, abs=0.012)
+@pytest.mark.parametrize("seeds", [2, 3, 5])
+@pytest.mark.parametrize("spread", [0.05, 0.5])
+def test_intervals_over_seeds_cover_the_truth_as_often_as_said(seeds, spread):
+    """Seeds differ, and so do scenes, which are easy or hard for all of them."""
+    rng = np.random.default_rng(seeds)
+
+    def solved(level, shape=(seeds, 400)):
+        eased = rng.normal(level, 1, (1, shape[1])) + rng.normal(0, spread, (shape[0], 1))
+        return rng.random(shape) < 1 / (1 + np.exp(-eased))
+
+    before, after = (solved(level, (4000, 4000)).mean() for level in (0.7, 1.5))
+    rates = [stats.rate_over_seeds(solved(0.7)) for _ in range(200)]
+    gains = [stats.paired_difference(solved(0.7), solved(1.5)) for _ in range(200)]
+    covered = np.mean([each.low <= before <= each.high for each in rates])
+    gained = np.mean([each.low <= 100 * (after - before) <= each.high for each in gains])
+    assert min(covered, gained) >= 0.9
 
 
 def test_paired_difference_by_hand():
@@ -115,14 +127,15 @@ def test_scenes_that_hardly_change_do_not_narrow_the_interval():
     assert lost.low == pytest.approx(-100 * upper)
     assert lost.low < none.low and 0 < lost.high < none.high
     seeds = stats.paired_difference(np.stack([before, before]), np.stack([after, before]))
-    assert lost.low < seeds.low < none.low
+    # A change of 0.01 points with as large an error, and one degree of freedom: 12.706 of them.
+    assert seeds.low == pytest.approx(-0.01 - 0.127062, abs=1e-5)
 
 
 def test_paired_difference_over_seeds_needs_agreement_of_seeds():
     before = np.zeros((2, 200))
     after = np.stack([np.ones(200), np.zeros(200)])  # one seed gains all, the other nothing
     difference = stats.paired_difference(before, after)
-    assert (difference.points, difference.low, difference.high) == (50.0, 0.0, 100.0)
+    assert (difference.points, difference.low, difference.high) == (50.0, -100.0, 100.0)
     assert difference.p_value > 0.05
     sure = stats.paired_difference(before, np.ones((2, 200)))
     assert sure.p_value < 0.001
@@ -136,7 +149,7 @@ NOISE = [(2, 0.0, 0.05), (5, 0.0, 0.05), (5, 0.3, 0.0)]
 
 @pytest.mark.parametrize(("seeds", "luck", "noise"), NOISE)
 def test_noise_of_seeds_and_luck_of_scenes_pass_for_gains_no_more_often_than_said(
-    few_resamples, seeds, luck, noise
+    seeds, luck, noise
 ):
     """Training moves the success of a seed, or of a scene for all of them, up as often as down."""
     rng = np.random.default_rng(seeds)
@@ -153,9 +166,7 @@ def test_noise_of_seeds_and_luck_of_scenes_pass_for_gains_no_more_often_than_sai
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.02])
-def test_a_gain_over_seeds_that_share_no_luck_of_scenes_is_found_as_by_a_t_test(
-    few_resamples, spread
-):
+def test_a_gain_over_seeds_that_share_no_luck_of_scenes_is_found_as_by_a_t_test(spread):
     rng = np.random.default_rng(1)
     found, expected = [], []
     for _ in range(40):
@@ -168,7 +179,7 @@ def test_a_gain_over_seeds_that_share_no_luck_of_scenes_is_found_as_by_a_t_test(
 
 
 @pytest.mark.parametrize("seeds", [2, 3])
-def test_seeds_that_gain_as_much_by_chance_are_no_proof(few_resamples, seeds):
+def test_seeds_that_gain_as_much_by_chance_are_no_proof(seeds):
     before, after = np.zeros((2, seeds, 100))
     after[range(seeds), range(seeds)] = 1  # each gains one scene, each another one
     assert stats.paired_difference(before, after).p_value > 0.2

@@ -15,7 +15,7 @@ from ifo_grounding.stats import (
     Estimate,
     Rate,
     paired_difference,
-    two_level_bootstrap,
+    rate_over_seeds,
     wilson,
 )
 
@@ -137,7 +137,7 @@ def seeds_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
         there = [p for p in ("phase1", "phase2") if all(p in run["results"] for run in same)]
         solved = [unpacked(same, phase) for phase in there]
         row: dict[str, Any] = {"runs": name, "seeds": len(same)}
-        row |= {p: brief(two_level_bootstrap(s)) for p, s in zip(there, solved, strict=True)}
+        row |= {p: brief(rate_over_seeds(s)) for p, s in zip(there, solved, strict=True)}
         gain = {"gain, points": brief(paired_difference(*solved))} if solved[1:] else {}
         rows.append(row | gain)
     return text_table(rows)

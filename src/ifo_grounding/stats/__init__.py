@@ -4,8 +4,8 @@ from ifo_grounding.stats.association import auc
 from ifo_grounding.stats.rates import (
     holm,
     paired_difference,
+    rate_over_seeds,
     reliability,
-    two_level_bootstrap,
     wilson,
 )
 from ifo_grounding.stats.results import Described, Difference, Estimate, Rate
@@ -18,7 +18,7 @@ __all__ = [
     "auc",
     "holm",
     "paired_difference",
+    "rate_over_seeds",
     "reliability",
-    "two_level_bootstrap",
     "wilson",
 ]

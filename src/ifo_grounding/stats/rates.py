@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from ifo_grounding.errors import UserError
 from ifo_grounding.stats.results import CONFIDENCE, Difference, Rate
 
-RESAMPLES = 4000
-"""Bootstrap replicates: bounds are stable to about a tenth of a width."""
 TAIL = (1 - CONFIDENCE) / 2
 
 
@@ -59,20 +57,6 @@ def reliability(probabilities: ArrayLike, happened: ArrayLike) -> list[tuple[flo
     ]
 
 
-def _bootstrap_bounds(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a percentile interval of the mean of [seeds, scenes]: seeds are drawn, then scenes.
-
-    Scenes in which every seed came out alike are drawn by their number, the same as one by one.
-    """
-    seeds, scenes = values.shape
-    rng = np.random.default_rng(0)
-    seed = rng.integers(seeds, size=(RESAMPLES, seeds))
-    patterns, counts = np.unique(values, axis=1, return_counts=True)
-    drawn = rng.multinomial(scenes, counts / scenes, size=RESAMPLES)
-    by_seed = drawn @ patterns.T / scenes
-    return np.quantile(np.take_along_axis(by_seed, seed, axis=1).mean(1), (TAIL, 1 - TAIL))
-
-
 def _as_matrix(outcomes: ArrayLike, name: str) -> NDArray[np.float64]:
     values = np.atleast_2d(np.asarray(outcomes, dtype=np.float64))
     if values.ndim != 2 or not values.size or not np.isin(values, (0.0, 1.0)).all():
@@ -80,45 +64,44 @@ def _as_matrix(outcomes: ArrayLike, name: str) -> NDArray[np.float64]:
     return values
 
 
-def two_level_bootstrap(outcomes: ArrayLike) -> Rate:
+def rate_over_seeds(outcomes: ArrayLike) -> Rate:
     """Return the mean success over training seeds, with an interval that counts their spread.
 
-    Each replicate draws seeds with replacement, then scenes, the same for every seed. The interval
-    is a percentile interval, widened to hold Wilson's of the pooled outcomes, so that it is never
-    empty; where all are the same, Wilson's of the scenes. With few seeds it is too narrow.
+    It is a t interval, for other seeds and other scenes, widened to hold Wilson's of the pooled
+    outcomes, so that it is never empty; where all are the same, Wilson's of the scenes. That of two
+    or three seeds is wide. Seeds of which few fail by much are the hardest to cover.
 
     Args:
         outcomes: successes, bool [seeds, scenes], column j the same scene for every seed; [scenes]
-            is one seed.
+            is one seed, with Wilson's interval.
 
-    >>> print(two_level_bootstrap([[1, 1, 0, 1], [1, 0, 0, 1]]).rate)
+    >>> print(rate_over_seeds([[1, 1, 0, 1], [1, 0, 0, 1]]).rate)
     0.625
     """
     values = _as_matrix(outcomes, "outcomes")
+    mean = float(values.mean())
     different = values.shape[1] if np.ptp(values) == 0 else values.size
-    least = wilson(round(different * float(values.mean())), different)
-    low, high = _bootstrap_bounds(values)
+    least = wilson(round(different * mean), different)
+    margin = _margin(values) if len(values) > 1 else 0.0
     return Rate(
-        rate=float(values.mean()),
-        low=min(float(low), least.low),
-        high=max(float(high), least.high),
+        rate=mean,
+        low=max(0.0, min(mean - margin, least.low)),
+        high=min(1.0, max(mean + margin, least.high)),
         successes=int(values.sum()),
         count=values.size,
-        method=f"bootstrap over {len(values)} seeds and their scenes",
+        method=f"t over {len(values)} seeds" if len(values) > 1 else least.method,
     )
 
 
 def paired_difference(before: ArrayLike, after: ArrayLike) -> Difference:
     """Compare two policies on the same scenes.
 
-    The interval comes from the two-level bootstrap. Where all but fewer than ten scenes fared
-    alike, which a bootstrap tells little from, it also covers the exact ones (Clopper and Pearson)
-    of how many became better and of how many worse. With one seed ([scenes]) the p-value is
-    McNemar's exact test, and speaks of this pair of policies; with several ([seeds, scenes]) it is
-    a t test over seeds, whose variance also counts what the scenes that they share have in common
-    and, where all seeds changed as much, what their scenes leave unexplained.
-    Two seeds hardly ever pass it, however narrow the interval. With several seeds the interval is
-    rather too wide where they hardly differ, and too narrow where they differ by much.
+    The interval is a t interval. Where all but fewer than ten scenes fared alike, it also covers
+    the exact ones (Clopper and Pearson) of how many became better and of how many worse. With one
+    seed ([scenes]) it speaks of this pair of policies, and the p-value is McNemar's exact test;
+    with several ([seeds, scenes]) both are a t test's over seeds, whose variance also counts what
+    the scenes that they share have in common and, where all seeds changed as much, what their
+    scenes leave unexplained. Two seeds hardly ever pass it.
 
     Args:
         before: successes of the first policy, bool [scenes] or [seeds, scenes].
@@ -140,18 +123,19 @@ def paired_difference(before: ArrayLike, after: ArrayLike) -> Difference:
     change = second - first
     seeds = len(change)
     better, worse = int((change > 0).sum()), int((change < 0).sum())
-    bounds = [*_bootstrap_bounds(change), *_exact_bounds(better, worse, *change.shape)]
+    mean, margin = float(change.mean()), _margin(change)
+    bounds = [mean - margin, mean + margin, *_exact_bounds(better, worse, *change.shape)]
     if seeds == 1:
         changed = better + worse
         p_value = float(scipy.stats.binomtest(better, changed).pvalue) if changed else 1.0
-        method = "bootstrap over scenes, exact McNemar test"
+        method = "t over scenes, exact McNemar test"
     else:
         p_value = _t_test(change)
-        method = f"bootstrap over {seeds} seeds and their scenes, t test over seeds"
+        method = f"t over {seeds} seeds"
     return Difference(
-        points=100 * float(change.mean()),
-        low=100 * float(min(bounds)),
-        high=100 * float(max(bounds)),
+        points=100 * mean,
+        low=100 * max(-1.0, min(bounds)),
+        high=100 * min(1.0, max(bounds)),
         better=better,
         worse=worse,
         count=change.size,
@@ -184,22 +168,39 @@ def _exact_upper(count: float, of: int) -> float:
     return 1.0 if count >= of else float(scipy.stats.beta.ppf(1 - TAIL, count + 1, of - count))
 
 
-def _t_test(change: NDArray[np.float64]) -> float:
-    """Return the p-value of no mean change in [seeds, scenes], for other seeds and other scenes."""
-    seeds, scenes = change.shape
-    by_seed, by_scene = change.mean(1, keepdims=True), change.mean(0, keepdims=True)
+def _standard_error(values: NDArray[np.float64]) -> tuple[float, int]:
+    """Return that of the mean of [seeds, scenes], for others of both, and its degrees of freedom.
+
+    Of one seed, for other scenes.
+    """
+    seeds, scenes = values.shape
+    if seeds == 1:
+        return (math.sqrt(values.var(ddof=1) / scenes) if scenes > 1 else 0.0), scenes - 1
+    by_seed, by_scene = values.mean(1, keepdims=True), values.mean(0, keepdims=True)
     error = by_seed.var(ddof=1) / seeds
     if scenes > 1:
         # What seeds and scenes leave unexplained is in the variance of both means: counted once.
-        rest = ((change - by_seed - by_scene + change.mean()) ** 2).sum()
-        rest /= (seeds - 1) * (scenes - 1) * change.size
+        rest = ((values - by_seed - by_scene + values.mean()) ** 2).sum()
+        rest /= (seeds - 1) * (scenes - 1) * values.size
         error += max(0.0, by_scene.var(ddof=1) / scenes - rest)
-        if np.ptp(change.sum(1)) == 0:  # seeds that agree by chance are no proof of no spread
+        if np.ptp(values.sum(1)) == 0:  # seeds that agree by chance are no proof of no spread
             error = max(error, rest)
-    error = math.sqrt(error)
+    return math.sqrt(error), seeds - 1
+
+
+def _margin(values: NDArray[np.float64]) -> float:
+    """Return half the width of the t interval of the mean of [seeds, scenes]."""
+    error, freedom = _standard_error(values)
+    return float(error * scipy.stats.t.ppf(1 - TAIL, freedom)) if error else 0.0
+
+
+def _t_test(change: NDArray[np.float64]) -> float:
+    """Return the p-value of no mean change in [seeds, scenes], for other seeds and other scenes."""
+    error, freedom = _standard_error(change)
     if not error:  # every scene fares alike with every seed
+        scenes = change.shape[1]
         return float(scipy.stats.binomtest(scenes, scenes).pvalue) if change.mean() else 1.0
-    return float(2 * scipy.stats.t.sf(abs(change.mean()) / error, seeds - 1))
+    return float(2 * scipy.stats.t.sf(abs(change.mean()) / error, freedom))
 
 
 def holm(p_values: ArrayLike) -> list[float]:

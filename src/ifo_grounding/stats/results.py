@@ -121,7 +121,7 @@ class Difference(Described):
     >>> print(Difference(2.5, 1.0, 4.0, better=60, worse=10, count=2000, p_value=1e-9, method=""))
     +2.5 points [+1.0, +4.0] (60 better, 10 worse, n=2000)
 
-    A bound that one digit would round to zero gets two:
+    A bound that one digit would round to zero gets more:
 
     >>> print(Difference(0.2, 0.02, 0.3, better=10, worse=2, count=5000, p_value=0.04, method=""))
     +0.20 points [+0.02, +0.30] (10 better, 2 worse, n=5000)
@@ -147,7 +147,7 @@ class Difference(Described):
     def __str__(self) -> str:
         """Return the difference, its interval and how many scenes changed."""
         changed = f"{self.better} better, {self.worse} worse, n={self.count}"
-        near_zero = any(0 < abs(bound) < 0.05 for bound in (self.low, self.high))
-        digits = 2 if near_zero or self.high - self.low < 0.25 else 1
+        nearest = min((abs(bound) for bound in (self.low, self.high) if bound), default=1.0)
+        digits = 3 if nearest < 0.005 else 2 if nearest < 0.05 or self.high - self.low < 0.25 else 1
         points, low, high = (f"{x:+.{digits}f}" for x in (self.points, self.low, self.high))
         return f"{points} points [{low}, {high}] ({changed})"
