@@ -19,7 +19,7 @@ from ifo_grounding import networks
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import FREE, STAGES, Options
 from ifo_grounding.data import Demonstrations, FrameDecoder, LabelReport, show_codes
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, did_you_mean
 from ifo_grounding.files import read_json, write_json, write_record
 from ifo_grounding.machine import keep_freed_memory, machine_of, release_freed_memory
 from ifo_grounding.options import plain
@@ -107,8 +107,10 @@ def refuse_missing(run: Run, options: Options, stage: str) -> None:
     before = [name for name in STAGES[: STAGES.index(last) + 1] if name != unused] if last else []
     if missing := [name for name in before if not run.record(name)]:
         given = [text for text in sys.argv[1:] if "=" in text and not text.startswith("until=")]
+        others = [path.name for path in run.folder.parent.glob("*") if not run.folder.exists()]
+        name = f"{run.name}{did_you_mean(run.folder.name, others)}"
         raise UserError(
-            f"{stage} needs {', '.join(missing)} of the run {run.name} first: ifo-grounding demo "
+            f"{stage} needs {', '.join(missing)} of the run {name} first: ifo-grounding demo "
             f"{shlex.join(given or [f'run={run.name}'])} until={missing[-1]}"
         )
 
@@ -208,13 +210,8 @@ def keep(
 
 def fit_options(options: Options, stage: Stage) -> dict[str, Any]:
     """Return how :func:`fit` is called for a stage."""
-    return {
-        "seed": options.seed,
-        "name": stage.name,
-        "checkpoint_seconds": options.checkpoint_seconds,
-        "progress": options.progress,
-        "cudagraph": True,
-    }
+    given = {name: getattr(options, name) for name in ("seed", "checkpoint_seconds", "progress")}
+    return {**given, "name": stage.name, "cudagraph": True}
 
 
 def finish(options: Options, stage: Stage, result: dict[str, Any], history: Any = None) -> dict:
@@ -255,7 +252,7 @@ def load_there(run: Run, files: Mapping[str, str], options: Options) -> dict[str
 
 
 def starting_policy(run: Run, options: Options, warm_start: bool) -> Any:
-    """Return the phase-1 policy where a network is to begin with its weights, else None."""
+    """Return the phase-1 policy where a network begins with its weights, else None."""
     return load_network(run, POLICIES["phase1"], options) if warm_start else None
 
 
@@ -271,8 +268,7 @@ def load_labels(run: Run) -> Tensor:
 
 def chosen_by(options: Options) -> dict[str, Any]:
     """Return how instructions are chosen."""
-    section = options.instruction
-    return {name: getattr(section, name) for name in ("threshold", "candidates", "choose")}
+    return {n: getattr(options.instruction, n) for n in ("threshold", "candidates", "choose")}
 
 
 def result_file(options: Options) -> Path:

@@ -165,6 +165,11 @@ def test_a_stage_without_what_it_needs_says_what_to_run(options, tmp_path, monke
     with pytest.raises(UserError, match=r"train_instruction, train_goal of .* until=train_goal"):
         examine(options())
     assert not (tmp_path / "run").exists()
+    (tmp_path / "move-few").mkdir()
+    monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path / "home"))
+    for run, hint in ("movefew", r" \(did you mean 'move-few'\?\)"), ("another", ""):
+        with pytest.raises(UserError, match=f"imitate of the run .*{run}{hint} first"):
+            evaluate(options(run=run))
 
 
 def test_other_scenes_are_measured_anew_and_kept(phase_1, capsys):
