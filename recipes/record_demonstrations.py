@@ -1,11 +1,18 @@
 """Record demonstrations, or read what others recorded: frames and instructions, never actions."""
 
+from typing import Any
+
 from _shared import DEMONSTRATIONS, TRUTH, finish, open_stage, tell, world_of
+from torchrl.envs.utils import RandomPolicy
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
-from ifo_grounding.errors import check_names_of_actions
+from ifo_grounding.errors import UserError, check_names_of_actions
+from ifo_grounding.evaluation import success_rate
 from ifo_grounding.worlds import World
+
+SCENES = 4
+"""Scenes in which a world is tried out."""
 
 
 def record(options: Options) -> dict:
@@ -28,15 +35,23 @@ def record(options: Options) -> dict:
 
 
 def try_out(world: World, seed: int) -> None:
-    """Begin an instructed episode, so that what is wrong with sentences is said before training.
+    """Step in instructed scenes, so that what is wrong with them is said before training.
 
     Raises:
-        UserError: where none can begin, or the names of actions are not as many as the actions.
+        UserError: where none can begin, where one seed shows several scenes, or where the names of
+            actions are not as many as the actions.
     """
     env = world.instructed(1, seed=seed, stream="validation")
-    env.reset()
     if world.actions and hasattr(env.action_spec, "n"):
         check_names_of_actions(world.actions, env.action_spec.n)
+    shown: Any = {"episodes": SCENES, "stream": "validation", "max_steps": 1}
+    random = RandomPolicy(env.action_spec)
+    first, again = (success_rate(random, env, **shown).scenes for _ in range(2))
+    if first != again:
+        raise UserError(
+            "the world shows other scenes each time it is given the same seed: let its reset draw "
+            "from that seed alone (in Gymnasium: super().reset(seed=seed), then self.np_random)"
+        )
 
 
 @recipe_main

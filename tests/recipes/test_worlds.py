@@ -18,6 +18,14 @@ from ifo_grounding.playground import Lesson
 from ifo_grounding.training import Run
 from ifo_grounding.worlds import BabyAI, Grid, OpenGrid, World
 
+
+class Seedless(dial_module.Dial):
+    """A world that takes no notice of seeds."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset()
+
+
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
 
 
@@ -63,6 +71,7 @@ def test_both_phases_run_on_ones_own_world(options, dial, tmp_path, world):
     [
         (["world.instruction=sentence"], "there is no instruction 'sentence'"),
         (["world.instruction=task", "world.names=[left,right]"], "3 actions and 2 names"),
+        (["world.instruction=task", f"world.factory={__name__}.Seedless"], "other scenes each"),
     ],
 )
 def test_what_is_wrong_with_a_world_is_said_before_anything_is_kept(options, dial, wrong, error):
