@@ -1,18 +1,27 @@
 """Record demonstrations, or read what others recorded: frames and instructions, never actions."""
 
+import sys
 from typing import Any
 
+import torch
 from _shared import DEMONSTRATIONS, TRUTH, finish, open_stage, tell, world_of
+from torch import Tensor
 from torchrl.envs.utils import RandomPolicy
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
+from ifo_grounding.distinct import hash_rows, words_of
 from ifo_grounding.errors import UserError, check_names_of_actions
 from ifo_grounding.evaluation import success_rate
+from ifo_grounding.keys import PIXELS
 from ifo_grounding.worlds import World
 
 SCENES = 4
 """Scenes in which a world is tried out."""
+SHOWN = 32
+"""First frames whose colours are compared, of recordings and of the simulator."""
+TOLERATED = 0.1
+"""Share of the recorded pixels that may be of colours new to the simulator."""
 
 
 def record(options: Options) -> dict:
@@ -22,6 +31,7 @@ def record(options: Options) -> dict:
     world, n = world_of(options), options.demonstrations.n
     if options.recorded:
         demos, truth = world.read(options.recorded, progress=options.progress)[:n], None
+        compare_colours(world, demos.first_frames()[:SHOWN], options.seed)
     else:
         demos, truth = world.demonstrate(n, seed=options.seed, progress=options.progress)
     if world.rewarded:
@@ -52,6 +62,24 @@ def try_out(world: World, seed: int) -> None:
             "the world shows other scenes each time it is given the same seed: let its reset draw "
             "from that seed alone (in Gymnasium: super().reset(seed=seed), then self.np_random)"
         )
+
+
+def compare_colours(world: World, frames: Tensor, seed: int) -> None:
+    """Say so where frames [N, C, H, W] have many colours that the simulator does not show."""
+    shown = world.simulator(2 * SHOWN, seed=seed).reset()[PIXELS].cpu()
+    known, more = colours(shown[:SHOWN]), colours(shown[SHOWN:])
+    others, own = ((~torch.isin(each, known)).float().mean() for each in (colours(frames), more))
+    if others > own + TOLERATED:
+        print(
+            f"note: {others:.0%} of the recorded pixels have colours that the simulator does not "
+            "show (grey pictures, JPEG, videos): what imitates one may fail in the other",
+            file=sys.stderr,
+        )
+
+
+def colours(frames: Tensor) -> Tensor:
+    """Return a number for the colour of each pixel of frames [N, C, H, W], int64 [N * H * W]."""
+    return hash_rows(words_of(frames.movedim(1, -1).flatten(0, 2)))
 
 
 @recipe_main

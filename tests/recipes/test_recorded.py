@@ -1,5 +1,7 @@
 """Demonstrations that were recorded elsewhere, through the recipes."""
 
+import re
+
 import pytest
 import torch
 
@@ -63,6 +65,30 @@ def test_recorded_demonstrations_have_to_fit(options, recipes, tmp_path, demos, 
     demos.save(tmp_path / "shown")
     with pytest.raises(UserError, match=refused):
         record(options(f"recorded={tmp_path / 'shown'}", *said))
+
+
+@pytest.mark.parametrize("changed", ["not", "grey", "jpeg", "scaled"])
+def test_colours_that_the_simulator_does_not_show_are_noted(
+    options, recipes, tmp_path, demos, changed, capsys
+):
+    from record_demonstrations import record
+
+    def seen(frames):
+        picture = frames.float()
+        if changed == "grey":
+            picture = picture.mean(1, keepdim=True).expand(frames.shape)
+        if changed == "jpeg":  # which loses a little of every colour
+            picture = picture + torch.randint(-3, 4, frames.shape)
+        return (picture * (0.9 if changed == "scaled" else 1)).clamp(0, 255).byte()
+
+    frames = [seen(demos[n]["pixels"]) for n in range(len(demos))]
+    data.Demonstrations.from_arrays(frames, demos.sentences(), vocabulary=demos.vocabulary).save(
+        tmp_path / "shown"
+    )
+    record(options(f"recorded={tmp_path / 'shown'}"))
+    noted = re.search(r"note: (\d+)% of the recorded pixels", capsys.readouterr().err)
+    assert (noted is None) == (changed == "not")
+    assert noted is None or int(noted[1]) > 20
 
 
 def test_recorded_words_have_to_be_the_worlds(options, tmp_path, demos):
