@@ -15,7 +15,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-demo: $(RUN) ## the main job: imitation of 50 demonstrations, self-examination, and a report (TASK=pick, ARGS="seed=1")
+demo: $(RUN) ## the main job: imitation of 40 demonstrations, self-examination, and a report (TASK=pick, ARGS="seed=1")
 	$(BIN)/ifo-grounding demo $(if $(TASK),task=$(TASK)) $(ARGS)
 
 test: $(DEV) ## all fast tests, doctests and examples of the docs

@@ -116,7 +116,7 @@ def test_few_demonstrations_take_a_budget_of_their_own_unless_one_is_named(tmp_p
         options = options_of(*said)
         return options.budget, options.demonstrations.n, options.imitate.batch_size
 
-    assert imitate()[:2] == imitate("task=move")[:2] == ("demo", 50)
+    assert imitate()[:2] == imitate("task=move")[:2] == ("demo", 40)
     assert imitate("task=pick")[:2] == ("few", 200)
     assert imitate("world=babyai")[:2] == imitate("preset=paper")[:2] == ("many", 3000)
     assert imitate("demonstrations.n=999") == ("few", 999, 64)
