@@ -119,7 +119,7 @@ def open_stage(options: Options, name: str, of: Any = None) -> Stage:
     """Return a stage of the run, done only if ``of`` these values, and say whether it is done."""
     release_freed_memory()  # of the stage before
     stage = open_run(options, name).stage(name)
-    if of is not None and stage.result and stage.result["of"] != of:
+    if of is not None and stage.result and stage.result.get("of") != of:
         stage.result = None
     torch.set_num_threads(options.threads)
     if options.progress:
