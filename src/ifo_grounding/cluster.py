@@ -21,7 +21,7 @@ from ifo_grounding.files import home
 RETRIES = 10
 """How often a task runs again whose process or machine died."""
 LOCKED = 60
-"""Seconds in which the processes of a dead machine give up their runs."""
+"""Seconds in which processes that end, or whose machine died, give up their runs."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,7 @@ def run_on_cluster(chains: Sequence[Sequence[Call]], progress: bool = True) -> l
                 except ray.exceptions.RayError:  # its own, or that of a call before
                     failed.add(call)
                 else:
+                    _wait_for(call.run)
                     bar.update()
     return [call for chain in chains for call in [each for each in chain if each in failed][:1]]
 
@@ -107,16 +108,22 @@ def _apply(function: Callable[[Any], Any], value: Any) -> Any:
     return function(value)
 
 
+def _wait_for(run: str) -> None:
+    """Wait until no other process works on a run: its task may be done before its process ends."""
+    from ifo_grounding.training import Run
+
+    for _ in range(LOCKED):
+        with suppress(UserError), Run(run).lock():
+            break
+        time.sleep(1)
+
+
 def _run(call: Call, folder: str, _before: None) -> None:
     """Run a recipe in this process, which is one of Ray's."""
     from ifo_grounding.cli import run_recipe
-    from ifo_grounding.training import Run
 
     os.chdir(folder)
-    for _ in range(LOCKED):
-        with suppress(UserError), Run(call.run).lock():
-            break
-        time.sleep(1)
+    _wait_for(call.run)
     call.log.parent.mkdir(parents=True, exist_ok=True)
     with call.log.open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:
