@@ -107,11 +107,11 @@ def refuse_missing(run: Run, options: Options, stage: str) -> None:
     before = [name for name in STAGES[: STAGES.index(last) + 1] if name != unused] if last else []
     if missing := [name for name in before if not run.record(name)]:
         given = [text for text in sys.argv[1:] if "=" in text and not text.startswith("until=")]
-        others = [path.name for path in run.folder.parent.glob("*") if not run.folder.exists()]
-        name = f"{run.name}{did_you_mean(run.folder.name, others)}"
+        beside = (path.name for path in run.folder.parent.glob("*"))
+        hint = "" if run.folder.exists() else did_you_mean(run.folder.name, beside)
         raise UserError(
-            f"{stage} needs {', '.join(missing)} of the run {name} first: ifo-grounding demo "
-            f"{shlex.join(given or [f'run={run.name}'])} until={missing[-1]}"
+            f"{stage} needs {', '.join(missing)} of the run {run.name}{hint} first: "
+            f"ifo-grounding demo {shlex.join(given or [f'run={run.name}'])} until={missing[-1]}"
         )
 
 

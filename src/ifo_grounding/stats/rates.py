@@ -79,17 +79,18 @@ def rate_over_seeds(outcomes: ArrayLike) -> Rate:
     0.625
     """
     values = _as_matrix(outcomes, "outcomes")
-    mean = float(values.mean())
+    if len(values) == 1:
+        return wilson(int(values.sum()), values.size)
+    mean, margin = float(values.mean()), _margin(*_standard_error(values))
     different = values.shape[1] if np.ptp(values) == 0 else values.size
     least = wilson(round(different * mean), different)
-    margin = _margin(values) if len(values) > 1 else 0.0
     return Rate(
         rate=mean,
         low=max(0.0, min(mean - margin, least.low)),
         high=min(1.0, max(mean + margin, least.high)),
         successes=int(values.sum()),
         count=values.size,
-        method=f"t over {len(values)} seeds" if len(values) > 1 else least.method,
+        method=f"t over {len(values)} seeds",
     )
 
 
@@ -123,14 +124,15 @@ def paired_difference(before: ArrayLike, after: ArrayLike) -> Difference:
     change = second - first
     seeds = len(change)
     better, worse = int((change > 0).sum()), int((change < 0).sum())
-    mean, margin = float(change.mean()), _margin(change)
+    mean, (error, freedom) = float(change.mean()), _standard_error(change)
+    margin = _margin(error, freedom)
     bounds = [mean - margin, mean + margin, *_exact_bounds(better, worse, *change.shape)]
     if seeds == 1:
         changed = better + worse
         p_value = float(scipy.stats.binomtest(better, changed).pvalue) if changed else 1.0
         method = "t over scenes, exact McNemar test"
     else:
-        p_value = _t_test(change)
+        p_value = _t_test(mean, error, freedom, scenes=change.shape[1])
         method = f"t over {seeds} seeds"
     return Difference(
         points=100 * mean,
@@ -188,19 +190,16 @@ def _standard_error(values: NDArray[np.float64]) -> tuple[float, int]:
     return math.sqrt(error), seeds - 1
 
 
-def _margin(values: NDArray[np.float64]) -> float:
-    """Return half the width of the t interval of the mean of [seeds, scenes]."""
-    error, freedom = _standard_error(values)
+def _margin(error: float, freedom: int) -> float:
+    """Return half the width of a t interval."""
     return float(error * scipy.stats.t.ppf(1 - TAIL, freedom)) if error else 0.0
 
 
-def _t_test(change: NDArray[np.float64]) -> float:
-    """Return the p-value of no mean change in [seeds, scenes], for other seeds and other scenes."""
-    error, freedom = _standard_error(change)
+def _t_test(mean: float, error: float, freedom: int, scenes: int) -> float:
+    """Return the p-value of no mean change."""
     if not error:  # every scene fares alike with every seed
-        scenes = change.shape[1]
-        return float(scipy.stats.binomtest(scenes, scenes).pvalue) if change.mean() else 1.0
-    return float(2 * scipy.stats.t.sf(abs(change.mean()) / error, freedom))
+        return float(scipy.stats.binomtest(scenes, scenes).pvalue) if mean else 1.0
+    return float(2 * scipy.stats.t.sf(abs(mean) / error, freedom))
 
 
 def holm(p_values: ArrayLike) -> list[float]:

@@ -162,12 +162,15 @@ class Run:
 
         made = self.options()
         if made is None:
-            if any(self.folder.glob("[!.]*")) and not (self / "stages").is_dir():
-                raise UserError(f"{self.folder} holds other files and no run: name another run")
+            self._refuse_other_files()
             with atomic_write(self / OPTIONS) as temporary:
                 OmegaConf.save(OmegaConf.create(options), temporary)
         elif found := difference(made, options, free):
             raise UserError(f"the run {self.name} was {found}, or give another run=")
+
+    def _refuse_other_files(self) -> None:
+        if any(self.folder.glob("[!.]*")) and not (self / "stages").is_dir():
+            raise UserError(f"{self.folder} holds other files and no run: name another run")
 
     def stage(self, name: str) -> Stage:
         """Return a stage of the run."""
@@ -216,8 +219,6 @@ class Run:
     def take_over(self, other: Run, without: Sequence[str] = ()) -> None:
         """Copy what another run has finished, but for its options, unless this one has begun.
 
-        A phase 2 can so be repeated with other options, from the same phase 1.
-
         Args:
             without: names of stages and files that this run is to make anew.
 
@@ -230,8 +231,7 @@ class Run:
         if not taken.exists():
             if (self / "stages").is_dir():  # all is taken over, but the options are not written
                 return
-            if any(self.folder.glob("[!.]*")):
-                raise UserError(f"{self.folder} holds other files and no run: name another run")
+            self._refuse_other_files()
             if not (other / "stages").is_dir():
                 raise UserError(f"{other.folder} holds no finished stages: run its recipes first")
             anew = [*NOT_TAKEN, *without, *(f"{name}.json" for name in without)]
