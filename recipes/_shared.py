@@ -53,7 +53,7 @@ OF_PHASE_2 = (
 )
 """Stages and files that a run makes anew where it takes over another's phase 1."""
 CHOSEN_ANEW = (
-    *("self_examine", "controls", "preset", "budget"),
+    *("self_examine", "controls"),
     *("instruction.threshold", "instruction.candidates", "instruction.choose"),
 )
 """Options that may differ from those of the run whose phase 1 is taken over."""

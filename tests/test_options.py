@@ -143,6 +143,26 @@ def test_a_run_goes_on_with_its_own_options(tmp_path):
             Run(other.run).begin(plain(other), FREE)
 
 
+def test_a_new_run_has_the_options_of_its_base(tmp_path):
+    base, run = f"base={tmp_path / 'base'}", f"run={tmp_path / 'new'}"
+    made = options_of("task=pick", "demonstrations.n=50", "seed=3", f"run={tmp_path / 'base'}")
+    Run(made.run).begin(plain(made), FREE)
+    new = options_of(base, run, "self_examine.lr=0.001")
+    assert (new.task, new.budget, new.seed, new.demonstrations.n) == ("pick", "few", 3, 50)
+    assert (new.imitate, new.goal) == (made.imitate, made.goal)
+    assert (new.self_examine.lr, new.self_examine.steps) == (1e-3, made.self_examine.steps)
+    assert (new.run, new.base) == (str(tmp_path / "new"), str(tmp_path / "base"))
+    assert options_of(base, run, "seed=4").seed == 4  # which is refused as the run is opened
+    with pytest.raises(UserError, match="needs run=, the name of the new run"):
+        options_of(base)
+
+
+def test_a_folder_of_recordings_is_the_same_with_a_slash_at_its_end(tmp_path):
+    record_demonstrations("move", 10, seed=0).save(tmp_path / "shown")
+    given = [options_of(f"recorded={tmp_path / 'shown'}{end}").recorded for end in ("", "/")]
+    assert given == 2 * [str(tmp_path / "shown")]
+
+
 def test_a_run_of_another_version_says_so(tmp_path):
     values = plain(options_of(f"run={tmp_path / 'run'}"))
     values["imitate"]["momentum"] = 0.9

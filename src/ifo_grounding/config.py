@@ -259,7 +259,7 @@ class Options:
     run: str = "${task}-${preset}-${budget}-seed${seed}"
     """Name of the run's folder under the home folder, or a path."""
     base: str | None = None
-    """Another run, whose stages up to phase 2 a new run takes over."""
+    """Another run, whose options and stages up to phase 2 a new run takes over."""
     recorded: str | None = None
     """Folder of demonstrations to learn from, in place of recording any."""
     until: str | None = None
@@ -312,3 +312,5 @@ class Options:
         if set("/\\\0") & set(self.variant or ""):
             raise UserError(f"variant is part of a file's name, without slashes: {self.variant!r}")
         check_device(self.device)
+        if self.recorded:
+            self.recorded = str(Path(self.recorded))  # without a slash at the end, the same one

@@ -32,8 +32,7 @@ from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
 FEW = 1000
 """With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
-LARGEST = 2**31 - 1
-"""Of whole numbers that are no seeds."""
+LARGEST = 2**31 - 1  # of whole numbers that are no seeds
 CONFIG = "config"
 """Name of the YAML that all recipes begin with."""
 MULTIRUN = ("-m", "--multirun")
@@ -83,10 +82,9 @@ def options_of_jobs(script: Path, arguments: Sequence[str], new: bool = False) -
     A script with a ``conf/<its name>.yaml`` has options of its own. With ``new``, they are those of
     a run that has not begun.
     """
-    own = (script.parent / "conf" / f"{script.stem}.yaml").exists()
     with _composing(script.parent):
         jobs = words_of_jobs(arguments)
-        if own:
+        if (script.parent / "conf" / f"{script.stem}.yaml").exists():
             known = compose(script.stem)
             texts = texts_of(OmegaConf.get_type(known))
             given = [[quoted(word, texts, comma="text") for word in job] for job in jobs]
@@ -149,11 +147,10 @@ def _combinations(words: Sequence[str]) -> list[list[str]]:
 
 
 def _settled(overrides: Sequence[str], new: bool = False) -> Options:
-    """Return composed options as dataclasses: those of the run, where it has begun.
+    """Return composed options as dataclasses: those of the run, or of its base, if it has begun.
 
-    What a run was made with wins over what a command does not name, but for what is of one command
-    (:data:`~ifo_grounding.config.PASSING`); what it names otherwise is refused where the run is
-    opened, unless it is free.
+    That wins over what a command does not name, but for :data:`~ifo_grounding.config.PASSING`;
+    what it names otherwise is refused where the run is opened, unless it is free.
     """
     words = [quoted(word) for word in overrides]
     named = {e.key_or_group: e.value() for e in OverridesParser.create().parse_overrides(words)}
@@ -172,6 +169,10 @@ def _settled(overrides: Sequence[str], new: bool = False) -> Options:
     if counted:  # all that were recorded, not as many as the budget would record
         cfg.demonstrations.n = number
     made = None if new else Run(cfg.run).options()
+    if made is None and cfg.base:
+        made = Run(cfg.base).options()
+        if "run" not in named:
+            raise UserError(f"base={cfg.base} needs run=, the name of the new run")
     return _typed(cfg if made is None else _goes_on(cfg, made, named))
 
 
@@ -187,8 +188,8 @@ def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Iterable[str]) -> Dic
     for name in leaves(made):
         if name not in known and not name.startswith("world."):
             raise UserError(
-                f"{cfg.run} was made with the option {name}, which this version does not have: "
-                "give another run=, or go on with the version that made it"
+                f"{cfg.base or cfg.run} was made with the option {name}, which this version does "
+                "not have: give another run=, or go on with the version that made it"
             )
     result = OmegaConf.create({**plain(cfg), **made})
     for name in [*PASSING, *named]:
@@ -240,8 +241,7 @@ def explained(error: Exception) -> UserError:
         return UserError(f"unknown {group} {given!r}{hint}: choose one of {', '.join(allowed)}")
     if isinstance(cause, (ConfigKeyError, ConfigAttributeError)) and cause.full_key:
         section, dot, option = cause.full_key.rpartition(".")
-        parent = cause.parent_node
-        names = sorted({*map(str, parent or ())} - {"hydra"})
+        names = sorted({*map(str, cause.parent_node or ())} - {"hydra"})
         where = f"{section!r} has" if section else "there are"
         hint = did_you_mean(cause.full_key, [f"{section}{dot}{name}" for name in names])
         for world, kind in WORLDS.items() if section == "world" else ():

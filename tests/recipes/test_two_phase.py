@@ -141,6 +141,8 @@ def test_a_new_run_takes_over_the_phase_1_of_another(options, tmp_path, capsys, 
     assert files[0].read_bytes() == files[1].read_bytes()
     with pytest.raises(UserError, match=r"made with imitate\.steps=20, not 30"):
         two_phase(options(base, "imitate.steps=30", run="third"))
+    with pytest.raises(UserError, match=r"made with preset=strong, not paper"):
+        two_phase(options(base, "preset=paper", run="third"))
     assert not (tmp_path / "third" / "policy-phase1.safetensors").exists()
     with pytest.raises(UserError, match="no finished stages"):
         two_phase(options(f"base={tmp_path / 'none'}", run="fourth"))
