@@ -1,5 +1,7 @@
 """CUDA graphs: which losses and optimisers they suit, and, on a GPU, that they learn the same."""
 
+import contextlib
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -22,7 +24,14 @@ from ifo_grounding.training import (
     self_examine,
 )
 from ifo_grounding.training.policy_gradient import Learner
-from ifo_grounding.training.updates import let_capture, make_optimizer, set_rates
+from ifo_grounding.training.updates import (
+    CapturedUpdate,
+    let_capture,
+    make_optimizer,
+    prepared,
+    set_rates,
+    update,
+)
 from ifo_grounding.transforms import InstructionSampler, LearnedReward
 
 
@@ -54,6 +63,42 @@ def test_only_steps_that_are_all_the_same_can_be_captured():
     suitable = make_instruction_classifier(demos, "paper", seed=0)
     assert InstructionLoss(suitable, demos.pool(), removal_rate=0.0).capturable
     assert not InstructionLoss(suitable, demos.pool(), removal_rate=0.3).capturable  # counts some
+
+
+def test_a_step_that_cannot_be_captured_goes_on_kernel_by_kernel(monkeypatch):
+    class Refused(contextlib.nullcontext):
+        def __exit__(self, *_):
+            raise RuntimeError("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", object)
+    monkeypatch.setattr(torch.cuda, "graph", Refused)
+    monkeypatch.setattr(CapturedUpdate, "_aside", lambda captured, batch: captured.update(batch))
+    seen = []
+    captured = CapturedUpdate(lambda batch: seen.append(float(batch["x"])) or {"x": batch["x"]})
+    batches = [TensorDict({"x": torch.tensor(float(n))}) for n in range(6)]
+    found = [captured(batch) for batch in batches[:3]]
+    with pytest.warns(UserWarning, match="cannot be one CUDA graph .*operation not permitted"):
+        found.append(captured(batches[3]))
+    found += [captured(batch) for batch in batches[4:]]
+    assert [float(each["x"]) for each in found] == [0, 1, 2, 3, 4, 5]
+    assert seen == [0, 1, 2, 3, 3, 4, 5]  # the fourth was recorded first, which computes nothing
+
+
+@pytest.mark.gpu
+def test_a_step_that_reads_something_back_learns_on_a_gpu():
+    weight = torch.nn.Parameter(torch.ones(2, device="cuda"))
+    optimizer = make_optimizer([weight], 0.1)
+
+    def step(batch):
+        loss = (weight * batch["x"]).sum()
+        return update(TensorDict({"loss_mine": loss * float(loss > -100)}), optimizer, 1.0)
+
+    made = prepared(step, optimizer, cudagraph=True)
+    batch = TensorDict({"x": torch.ones(2, device="cuda")})
+    with pytest.warns(UserWarning, match="cannot be one CUDA graph"):
+        losses = [float(made(batch)["loss_mine"]) for _ in range(6)]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[0] - losses[-1] > 0.9  # 0.1 of both weights in each step
 
 
 @pytest.mark.gpu

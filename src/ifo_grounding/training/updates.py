@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -80,6 +81,8 @@ class CapturedUpdate:
     Python launches the hundreds of kernels of a small network's step more slowly than a GPU
     computes them. ``tensordict.nn.CudaGraphModule`` synchronises with the GPU at every call.
 
+    An update that cannot be captured goes on kernel by kernel, after a warning.
+
     Args:
         update: maps a batch to metrics, by the same kernels whatever the batch holds, reads nothing
             back to the CPU, and steps an optimizer prepared by :func:`let_capture`.
@@ -88,6 +91,7 @@ class CapturedUpdate:
     def __init__(self, update: Update) -> None:
         self.update = update
         self.made = 0
+        self.suits = True
         self.graph: torch.cuda.CUDAGraph | None = None
         self.batch: TensorDictBase
         self.metrics: dict[str, Tensor]
@@ -97,17 +101,22 @@ class CapturedUpdate:
         self.made += 1
         if self.made <= WARM_UP:
             return self._aside(batch)
+        if not self.suits:
+            return self.update(batch)
         if self.graph is None:
-            self.batch, self.graph = batch.clone(), torch.cuda.CUDAGraph()
+            self.batch, graph = batch.clone(), torch.cuda.CUDAGraph()
             try:
-                with torch.cuda.graph(self.graph):
+                with torch.cuda.graph(graph):
                     self.metrics = self.update(self.batch)
             except RuntimeError as error:
-                raise UserError(
-                    f"this step cannot be one CUDA graph ({first_line(error)}): its network reads "
-                    "something back, or computes other shapes for other batches; pass "
-                    "cudagraph=False"
-                ) from error
+                self.suits = False
+                warnings.warn(
+                    f"a step cannot be one CUDA graph ({first_line(error)}) and takes longer: its "
+                    "network reads something back, or computes other shapes for other batches",
+                    stacklevel=2,
+                )
+                return self.update(batch)
+            self.graph = graph
         else:
             self.batch.update_(batch)
         self.graph.replay()
