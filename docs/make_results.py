@@ -1,6 +1,6 @@
 """Write every table and plot: ``python docs/make_results.py`` after ``results/`` has changed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from statistics import median
 
@@ -129,16 +129,28 @@ def by_method() -> dict[tuple[str, int], dict[str, Runs]]:
 
 def baseline_rows() -> list[Row]:
     """Return a row for each method of Table 1, with its success for each set of demonstrations."""
-    found = {f"{task} {n:,}": methods for (task, n), methods in by_method().items()}
+    found = by_method()
     return [
         {"method": f"`{method}`" + (f": {used}" if used else "")}
         | {
-            title: brief(rate(methods[method], method)) if method in methods else ""
-            for title, methods in found.items()
+            f"{task} {n:,}{more_seeds(methods.values())}": (
+                brief(rate(methods[method], method)) if method in methods else ""
+            )
+            for (task, n), methods in found.items()
         }
         for method, used in USES.items()
         if any(method in methods for methods in found.values())
     ]
+
+
+def more_seeds(methods: Iterable[Runs]) -> str:
+    """Return how many seeds all methods of a column ran, where that is not one.
+
+    Raises:
+        ValueError: where some ran others than the rest.
+    """
+    (seeds,) = {tuple(sorted(run["options"]["seed"] for run in runs)) for runs in methods}
+    return f", {len(seeds)} seeds" if len(seeds) > 1 else ""
 
 
 def ahead_rows() -> list[Row]:
@@ -154,7 +166,7 @@ def ahead_rows() -> list[Row]:
         best = min(behind, key=lambda m: behind[m].points)
         rows.append(
             {
-                "demonstrations": f"{task} {n:,}",
+                "demonstrations": f"{task} {n:,}{more_seeds(found.values())}",
                 "best rival": f"`{best}`",
                 "`ours` ahead, points": brief(behind[best]),
                 "p": shown_p(p[best]),
