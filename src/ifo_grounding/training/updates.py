@@ -104,10 +104,10 @@ class CapturedUpdate:
         if not self.suits:
             return self.update(batch)
         if self.graph is None:
-            self.batch, graph = batch.clone(), torch.cuda.CUDAGraph()
+            kept, graph = batch.clone(), torch.cuda.CUDAGraph()
             try:
                 with torch.cuda.graph(graph):
-                    self.metrics = self.update(self.batch)
+                    metrics = self.update(kept)
             except RuntimeError as error:
                 self.suits = False
                 warnings.warn(
@@ -116,7 +116,7 @@ class CapturedUpdate:
                     stacklevel=2,
                 )
                 return self.update(batch)
-            self.graph = graph
+            self.batch, self.graph, self.metrics = kept, graph, metrics
         else:
             self.batch.update_(batch)
         self.graph.replay()
