@@ -1,6 +1,6 @@
 """Write every table and plot: ``python docs/make_results.py`` after ``results/`` has changed."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from statistics import median
 
@@ -133,8 +133,10 @@ def baseline_rows() -> list[Row]:
     return [
         {"method": f"`{method}`" + (f": {used}" if used else "")}
         | {
-            f"{task} {n:,}{more_seeds(methods.values())}": (
-                brief(rate(methods[method], method)) if method in methods else ""
+            f"{task} {n:,}{more_seeds(*methods.values())}": (
+                brief(rate(methods[method], method)) + own_seeds(methods, method)
+                if method in methods
+                else ""
             )
             for (task, n), methods in found.items()
         }
@@ -143,14 +145,15 @@ def baseline_rows() -> list[Row]:
     ]
 
 
-def more_seeds(methods: Iterable[Runs]) -> str:
-    """Return how many seeds all methods of a column ran, where that is not one.
+def more_seeds(*methods: Runs) -> str:
+    """Return how many seeds ran, where all methods have as many and more than one."""
+    (most, *others) = {len(runs) for runs in methods}
+    return f", {most} seeds" if most > 1 and not others else ""
 
-    Raises:
-        ValueError: where some ran others than the rest.
-    """
-    (seeds,) = {tuple(sorted(run["options"]["seed"] for run in runs)) for runs in methods}
-    return f", {len(seeds)} seeds" if len(seeds) > 1 else ""
+
+def own_seeds(methods: dict[str, Runs], method: str) -> str:
+    """Return how many seeds a method ran, where its column does not say so."""
+    return "" if more_seeds(*methods.values()) else more_seeds(methods[method])
 
 
 def ahead_rows() -> list[Row]:
@@ -166,7 +169,7 @@ def ahead_rows() -> list[Row]:
         best = min(behind, key=lambda m: behind[m].points)
         rows.append(
             {
-                "demonstrations": f"{task} {n:,}{more_seeds(found.values())}",
+                "demonstrations": f"{task} {n:,}{more_seeds(*found.values())}",
                 "best rival": f"`{best}`",
                 "`ours` ahead, points": brief(behind[best]),
                 "p": shown_p(p[best]),
