@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from functools import cache
-from statistics import median
+from itertools import chain
+from statistics import fmean, median
 
 import make_speed
 import make_tables
@@ -120,25 +121,34 @@ PEERS = ("ours", "imitation", "imitation, own reward")
 
 
 @cache
-def by_method() -> dict[tuple[str, int], dict[str, Runs]]:
-    """Return the runs of each method of Table 1 by task and number of demonstrations."""
-    found = read("baselines", lambda o: (o["task"], o["demonstrations"]["n"], o["method"]))
-    sets = sorted({key[:2] for key in found}, key=lambda key: (TASKS.index(key[0]), -key[1]))
+def by_method() -> dict[tuple[str, int, str], dict[str, Runs]]:
+    """Return the runs of each method of Table 1 by task, number of demonstrations and preset."""
+    found = read(
+        "baselines", lambda o: (o["task"], o["demonstrations"]["n"], o["preset"], o["method"])
+    )
+    sets = sorted(
+        {key[:3] for key in found}, key=lambda key: (TASKS.index(key[0]), -key[1], key[2])
+    )
     return {key: {m: found[(*key, m)] for m in USES if (*key, m) in found} for key in sets}
 
 
-def baseline_rows() -> list[Row]:
-    """Return a row for each method of Table 1, with its success for each set of demonstrations."""
-    found = by_method()
+def title_of(task: str, number: int, preset: str) -> str:
+    """Return the name of a set of runs."""
+    return f"{task} {number:,}" + ("" if preset == "strong" else f", preset `{preset}`")
+
+
+def baseline_rows(few: bool) -> list[Row]:
+    """Return a row for each method of Table 1: every task with 200, or what else ran."""
+    found = {k: v for k, v in by_method().items() if (k[1:] == (200, "strong")) == few}
     return [
         {"method": f"`{method}`" + (f": {used}" if used else "")}
         | {
-            f"{task} {n:,}{more_seeds(*methods.values())}": (
+            title_of(*key) + more_seeds(*methods.values()): (
                 brief(rate(methods[method], method)) + own_seeds(methods, method)
                 if method in methods
                 else ""
             )
-            for (task, n), methods in found.items()
+            for key, methods in found.items()
         }
         for method, used in USES.items()
         if any(method in methods for methods in found.values())
@@ -159,7 +169,7 @@ def own_seeds(methods: dict[str, Runs], method: str) -> str:
 def ahead_rows() -> list[Row]:
     """Return how far ours is ahead of the best rival, and of which it is not; p by Holm."""
     rows = []
-    for (task, n), found in by_method().items():
+    for key, found in by_method().items():
         rivals = {m: runs for m, runs in found.items() if m not in ("ours", "random")}
         both = {m: with_ours(runs, found.get("ours", [])) for m, runs in rivals.items()}
         behind = {m: difference(runs, m, "ours") for m, runs in both.items() if runs}
@@ -169,7 +179,7 @@ def ahead_rows() -> list[Row]:
         best = min(behind, key=lambda m: behind[m].points)
         rows.append(
             {
-                "demonstrations": f"{task} {n:,}{more_seeds(*found.values())}",
+                "demonstrations": title_of(*key) + more_seeds(*found.values()),
                 "best rival": f"`{best}`",
                 "`ours` ahead, points": brief(behind[best]),
                 "p": shown_p(p[best]),
@@ -200,18 +210,28 @@ def peer_rows() -> list[Row]:
     return rows
 
 
+def mean_curve(runs: Runs) -> dict[int, float]:
+    """Return the success on validation scenes by frames, the mean of seeds."""
+    found: dict[int, list[float]] = {}
+    for frames, share in chain(*(run["results"].get("curve", ()) for run in runs)):
+        found.setdefault(frames, []).append(share)
+    return {frames: fmean(shares) for frames, shares in found.items()}
+
+
 def baseline_curves() -> bytes:
-    """Draw the success on validation scenes of each method that learns by policy gradient."""
+    """Draw the curves of methods that learn by policy gradient, where one of them gets far."""
     rows, panels = [], {}
-    for (task, number), found in by_method().items():
-        title = f"{task}, {number:,} demonstrations: success"
-        panels[title] = {f"{title} {method}": method for method in found}
-        for method, runs in found.items():
-            curve = runs[0]["results"].get("curve", ())
-            rows += [{"step": frames, f"{title} {method}": rate} for frames, rate in curve]
+    for key, found in by_method().items():
+        title, means = title_of(*key), {m: mean_curve(runs) for m, runs in found.items()}
+        if all(share < 0.1 for mean in means.values() for share in mean.values()):
+            continue
+        panels[title] = {f"{title} {method}": method for method in means}
+        for method, mean in means.items():
+            rows += [{"step": frames, f"{title} {method}": mean[frames]} for frames in mean]
     figure = training_curves(sorted(rows, key=lambda row: row["step"]), panels)
     for axes in figure.axes:
         axes.set_ylim(-0.05, 1.05)
+        axes.set_xlabel("frames")
     return figure_png(figure)
 
 
@@ -232,7 +252,8 @@ def tables() -> dict[str, str]:
         "up-to-2000": [row for key, row in rows.items() if 200 < key[1] <= 2000],
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
-        "baselines": baseline_rows(),
+        "baselines": baseline_rows(few=True),
+        "baselines-more": baseline_rows(few=False),
         "ours-ahead": ahead_rows(),
         "peers": peer_rows(),
     }
