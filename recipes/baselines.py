@@ -63,6 +63,9 @@ from ifo_grounding.training import Run, Stage, fit, improve_policy
 
 ENTROPY = 0.01
 """Weight of the entropy bonus of a policy that learns from a discriminator."""
+WINDOW = 64
+"""Steps of each world per iteration where every step is paid: in windows hardly longer than
+episodes even a perfect policy stops less often than demonstrations do."""
 ROWS = 32
 """Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {
@@ -232,6 +235,7 @@ def adversarial(options: Options, stage: Stage) -> None:
         options.preset,
         steps=section.steps,
         lr=section.lr,
+        gamma=options.self_examine.gamma,
         stop_action=world.stop_action,
         shapes=policy.network_config.shapes,
         seed=options.seed,
@@ -240,11 +244,12 @@ def adversarial(options: Options, stage: Stage) -> None:
     )
     read_fast(adversary.demonstrations, options)
     reading_codes(adversary.network, options)
-    practice = options.self_examine
+    practice = windows_of(options)
     worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
     config = replace(
         practice,
         iterations=math.ceil(section.frames / rounds),
+        anneal=False,  # the reward goes on changing
         entropy=ENTROPY,
         value_warmup=0 if begun is None else practice.value_warmup,
         select_every=0,
@@ -270,6 +275,15 @@ def adversarial(options: Options, stage: Stage) -> None:
     )
     save_network(run, file_of(method), policy)
     finish(options, stage, {"of": plain(section), **history[-1]}, history)
+
+
+def windows_of(options: Options) -> Any:
+    """Return the settings of phase 2, with as many frames per iteration in longer windows."""
+    practice = options.self_examine
+    if options.method in ("agile", "agile-chosen"):  # paid at the stop alone
+        return practice
+    worlds = math.ceil(practice.num_envs * practice.steps / WINDOW)
+    return replace(practice, num_envs=worlds, steps=WINDOW)
 
 
 def access(options: Options, run: Run) -> Any:

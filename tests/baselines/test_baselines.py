@@ -12,6 +12,7 @@ from ifo_grounding import networks
 from ifo_grounding.baselines import (
     AGILE,
     GAIL,
+    AbsorbingState,
     ActionDemonstrations,
     ChangeNetwork,
     ChosenAGILE,
@@ -19,6 +20,7 @@ from ifo_grounding.baselines import (
     DiscriminatorReward,
     GAIfO,
     SteppableDemonstrations,
+    StopReward,
     steps_of_policy,
 )
 from ifo_grounding.data import record_demonstrations
@@ -161,7 +163,9 @@ def test_demonstrations_with_another_instruction_are_negatives():
     assert "swapped_probability" not in set(alike.keys())
 
 
-def test_every_step_is_paid_its_logit_or_the_stop_its_verdict():
+def paid_steps():
+    """Three steps, a network that scores how bright they get, and what they led to."""
+
     def brightness(pixels, _):
         return pixels.float().mean((-3, -2, -1)).unsqueeze(-1) - 1.0
 
@@ -171,10 +175,36 @@ def test_every_step_is_paid_its_logit_or_the_stop_its_verdict():
         {"instruction": torch.ones(3, 2).long(), "action": torch.tensor([STOP, STOP, 0])}, [3]
     )
     bright = torch.tensor([3, 0, 3], dtype=torch.uint8).view(3, 1, 1, 1).expand(3, 3, 8, 8)
-    after = TensorDict({"pixels": bright}, [3])
-    assert DiscriminatorReward(model).pay(before, after).tolist() == [[2.0], [-1.0], [2.0]]
-    at_stop = DiscriminatorReward(model, at_stop=STOP)
-    assert at_stop.pay(before, after).tolist() == [[1.0], [0.0], [0.0]]
+    ended = torch.tensor([[True], [True], [False]])
+    return model, before, TensorDict({"pixels": bright, "terminated": ended}, [3])
+
+
+def test_a_stop_is_paid_the_verdict():
+    model, before, after = paid_steps()
+    assert StopReward(model, STOP).pay(before, after).tolist() == [[1.0], [0.0], [0.0]]
+
+
+def test_every_step_is_paid_its_logit_and_an_end_what_the_absorbing_state_pays():
+    model, before, after = paid_steps()
+    state = AbsorbingState(3.0, gamma=0.5)
+    reward = DiscriminatorReward(model, state)
+    assert reward.pay(before, after).tolist() == [[2.0], [-1.0], [2.0]]  # nothing is counted yet
+    done = torch.tensor([[False, True, False, False], [False, False, False, True]]).unsqueeze(-1)
+    state.count(TensorDict({"next": {"done": done}}, [2, 4]))  # four steps an episode
+    step = math.log((1 - 1 / 8) / (1 - 1 / 16))
+    end = sum(0.5**later * math.log((1 / 8) / (1 / 16)) for later in range(60))
+    expected = [[2 + step + end], [-1 + step + end], [2 + step]]
+    torch.testing.assert_close(reward.pay(before, after), torch.tensor(expected))
+
+
+@pytest.mark.parametrize("length", [2, 5, 9])
+def test_episodes_as_long_as_demonstrations_are_paid_logits_alone(length):
+    done = torch.arange(1, 91).remainder(length).eq(0).view(1, -1, 1)
+    state = AbsorbingState(float(length), gamma=0.95)
+    state.count(
+        TensorDict({"next": {"done": done[:, : 90 // length * length]}}, [1, 90 // length * length])
+    )
+    torch.testing.assert_close(torch.stack([state.step, state.end]), torch.zeros(2))
 
 
 def test_the_reward_of_a_step_is_that_of_what_it_led_to(sources):
@@ -222,13 +252,19 @@ def test_a_discriminator_is_built_for_the_actions_of_its_world(method, sources):
 def test_updates_tell_demonstrations_from_the_policy(name, sources):
     method = {"actions": GAIL, "frames": GAIfO, "steps": AGILE}[name]
     torch.manual_seed(0)
-    adversary = method(sources[name], steps=20, lr=1e-2, batch_size=32, features=16, seed=0)
+    how = {"steps": 20, "lr": 1e-2, "batch_size": 32, "prior": 0.0}
+    adversary = method(sources[name], features=16, seed=0, **how)
     batch = sources["steps"].starts(seed=2).rollout(12, break_when_any_done=False)
     metrics = adversary(batch)
     assert not adversary.network.training
     later = adversary(batch)
     gap = later["reward/demonstrated_probability"] - later["reward/policy_probability"]
     assert gap > 0.5 and later["reward/loss_discriminator"] < metrics["reward/loss_discriminator"]
+
+
+def test_fewer_demonstrations_count_less_than_the_prior(sources):
+    adversary = GAIfO(sources["frames"], prior=600.0, **SMALL)
+    assert [group["weight_decay"] for group in adversary.optimizer.param_groups] == [50.0]
 
 
 def test_agile_needs_a_stop(sources):

@@ -16,16 +16,17 @@ from ifo_grounding.baselines.adversarial import (
     ChangeNetwork,
     ChosenAGILE,
     DiscriminatorLoss,
-    DiscriminatorReward,
     GAIfO,
 )
 from ifo_grounding.baselines.bco import steps_of_policy
 from ifo_grounding.baselines.lc_rl import LCRL
+from ifo_grounding.baselines.rewards import AbsorbingState, DiscriminatorReward, StopReward
 
 __all__ = [
     "AGILE",
     "GAIL",
     "LCRL",
+    "AbsorbingState",
     "ActionDemonstrations",
     "Adversary",
     "ChangeNetwork",
@@ -35,5 +36,6 @@ __all__ = [
     "GAIfO",
     "SteppableActionDemonstrations",
     "SteppableDemonstrations",
+    "StopReward",
     "steps_of_policy",
 ]

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 
@@ -25,6 +25,7 @@ from ifo_grounding.baselines.access import (
     check_access,
     transitions_of,
 )
+from ifo_grounding.baselines.rewards import AbsorbingState, DiscriminatorReward, StopReward
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.errors import UserError, share
 from ifo_grounding.networks import (
@@ -35,7 +36,7 @@ from ifo_grounding.networks import (
 from ifo_grounding.networks.trunk import RewardNetwork
 from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.training import AdversarialUpdates
-from ifo_grounding.transforms.base import rows_of
+from ifo_grounding.training.loop import Metrics
 from ifo_grounding.transforms.reward import RewardTransform
 
 
@@ -50,7 +51,7 @@ class DiscriminatorLoss(SupervisedLoss):
     Args:
         network: what it reads of a step, the instruction too, to one logit.
         spare: share of the policy's steps, those that look most like demonstrations, that is left
-            out: they may be right (rho of AGILE).
+            out: they may be right (1 - rho of AGILE).
         swapped: whether demonstrations with another one's instruction are negatives, too (Zolna et
             al. 2020): half of the weight of negatives.
 
@@ -102,42 +103,6 @@ class DiscriminatorLoss(SupervisedLoss):
         return self.network(read).get(self.output).reshape(-1).float()
 
 
-class DiscriminatorReward(RewardTransform):
-    """Pays every step what a discriminator makes of it.
-
-    Args:
-        discriminator: its ``in_keys`` may name what a step led to, as ``("next", "pixels")``.
-        at_stop: the action by which a policy ends an episode: then 1 is paid at the stop where the
-            probability exceeds one half, and nothing before (AGILE). None pays every step its logit
-            (log D - log(1 - D), Fu et al. 2018), which neither rewards nor punishes long episodes
-            as such.
-    """
-
-    def __init__(self, discriminator: TensorDictModuleBase, at_stop: int | None = None) -> None:
-        self.later = [key in (keys.NEXT_PIXELS, ENDED) for key in discriminator.in_keys]
-        read = [
-            key[-1] if later else key
-            for key, later in zip(discriminator.in_keys, self.later, strict=True)
-        ]
-        also = [] if at_stop is None else [keys.ACTION]
-        super().__init__(discriminator, str(discriminator.out_keys[0]), [*read, *also], None, also)
-        self.at_stop = at_stop
-
-    def pay(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
-        """Return the reward, float32 [*B, 1]."""
-        entries = [
-            rows_of(after if later else before, key)
-            for later, key in zip(self.later, self.in_keys, strict=False)
-        ]
-        if self.at_stop is None:
-            return self._score(entries).view(*before.batch_size, 1)
-        stops = rows_of(before, keys.ACTION) == self.at_stop
-        reward = torch.zeros(len(stops), device=stops.device)
-        rows = stops.nonzero().squeeze(-1)
-        reward[rows] = (self._score([entry[rows] for entry in entries]) > 0).float()
-        return reward.view(*before.batch_size, 1)
-
-
 def frames_of(seen: Any) -> Demonstrations:
     """Return the demonstrations, whatever else a method may use."""
     demos: Demonstrations = seen if isinstance(seen, Demonstrations) else seen.demos
@@ -151,6 +116,9 @@ class Adversary(AdversarialUpdates):
         seen: what the method may use; another kind is refused.
         preset: of the network.
         steps: gradient steps after each iteration.
+        prior: weight decay times demonstrations, as of
+            :class:`~ifo_grounding.training.FitConfig`.
+        gamma: discount of the policy gradient.
         stop_action: the action by which a policy ends an episode.
         shapes: what the network is built for, such as the policy's ``network_config.shapes``; by
             default the demonstrations, with the six actions of the own world.
@@ -165,7 +133,7 @@ class Adversary(AdversarialUpdates):
     spare = 0.0
     """Share of the policy's steps that is left out."""
     network: TensorDictModule
-    reward: DiscriminatorReward
+    reward: RewardTransform
 
     def __init__(
         self,
@@ -176,16 +144,26 @@ class Adversary(AdversarialUpdates):
         lr: float = 3e-4,
         batch_size: int = 256,
         swapped: bool = True,
+        prior: float = 800.0,
+        gamma: float = 0.95,
         stop_action: int | None = keys.STOP,
         shapes: Any = None,
         **options: Any,
     ) -> None:
         check_access(self, seen, self.access)
-        self.stop_action = stop_action
-        self.network = self.discriminator(shapes or frames_of(seen), preset, **options)
-        self.reward = self.paid()
+        self.stop_action, demos = stop_action, frames_of(seen)
+        self.network = self.discriminator(shapes or demos, preset, **options)
         loss = DiscriminatorLoss(self.network, spare=self.spare, swapped=swapped)
-        super().__init__(loss, self.demonstrated(seen), steps, lr, batch_size)
+        # Part of the loss, so that a checkpoint holds what it has counted.
+        loss.absorbing = AbsorbingState(float(demos.lengths.float().mean()) - 1, gamma)
+        self.reward = self.paid(loss.absorbing)
+        decay = prior / len(demos)
+        super().__init__(loss, self.demonstrated(seen), steps, lr, batch_size, decay)
+
+    def __call__(self, batch: TensorDictBase) -> Metrics:
+        """Count the policy's steps [N, T], train on them, and return mean metrics."""
+        self.loss.absorbing.count(batch)
+        return super().__call__(batch)
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:
         """Return the demonstrated steps that are told apart from the policy's."""
@@ -195,9 +173,9 @@ class Adversary(AdversarialUpdates):
         """Return the network."""
         raise NotImplementedError
 
-    def paid(self) -> DiscriminatorReward:
+    def paid(self, absorbing: AbsorbingState) -> RewardTransform:
         """Return the transform that pays."""
-        return DiscriminatorReward(self.network)
+        return DiscriminatorReward(self.network, absorbing)
 
 
 class GAIL(Adversary):
@@ -265,12 +243,12 @@ class GAIfO(Adversary):
 class AGILE(Adversary):
     """Tells last frames of demonstrations from the policy's states: state, instruction.
 
-    The quarter of the policy's states that it likes best is left out. Paid is the stop where the
-    discriminator finds the instruction fulfilled: our worlds end there, those of the paper do not.
+    Of the policy's states the three quarters that it likes best are left out. Paid is the stop
+    where it finds the instruction fulfilled: our worlds end there, those of the paper do not.
     """
 
     access: type[Any] = SteppableDemonstrations
-    spare = 0.25
+    spare = 0.75
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(frames_of(seen), last=True)
@@ -279,12 +257,12 @@ class AGILE(Adversary):
         in_keys = (keys.NEXT_PIXELS, keys.INSTRUCTION)
         return make_instruction_classifier(shapes, preset, in_keys=in_keys, **options)
 
-    def paid(self) -> DiscriminatorReward:  # noqa: D102
+    def paid(self, absorbing: AbsorbingState) -> DiscriminatorReward:  # noqa: D102
         if self.stop_action is None:
             raise UserError(
                 "AGILE is paid at the stop, and this world has none: give world.stop=add"
             )
-        return DiscriminatorReward(self.network, at_stop=self.stop_action)
+        return StopReward(self.network, self.stop_action)
 
 
 class ChosenAGILE(AGILE):

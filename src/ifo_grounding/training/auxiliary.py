@@ -57,6 +57,7 @@ class AdversarialUpdates:
             :class:`~ifo_grounding.objectives.RewardLoss`.
         steps: gradient steps after each iteration of self-examination.
         batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
+        weight_decay: decoupled, of the reward model.
     """
 
     loss: Any
@@ -68,10 +69,11 @@ class AdversarialUpdates:
         steps: int,
         lr: float,
         batch_size: int = 256,
+        weight_decay: float = 0.0,
     ) -> None:
         self.loss, self.demonstrations = loss, demonstrations
         self.steps, self.batch_size = steps, batch_size
-        self.optimizer = make_optimizer(loss.parameters(), lr)
+        self.optimizer = make_optimizer(loss.parameters(), lr, weight_decay)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Train on the policy's steps [N, T] and return mean metrics, named ``reward/...``."""
