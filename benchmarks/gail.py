@@ -26,7 +26,7 @@ from ifo_grounding.data import Demonstrations, Truth
 from ifo_grounding.files import write_json
 from ifo_grounding.report import provenance
 from ifo_grounding.report.results import by_scene
-from ifo_grounding.training import SelfExaminationConfig, improve_policy
+from ifo_grounding.training import AdversarialUpdates, SelfExaminationConfig, improve_policy
 
 THEIRS = {"imitation": "logit", "imitation, own reward": "own"}
 """What the package pays: ours, log D - log(1 - D), or its own, -log(1 - D)."""
@@ -47,7 +47,10 @@ class OfNumbers(nn.Module):
 
 
 class SmallGAIL(GAIL):
-    """GAIL with a discriminator of the sizes of the package's."""
+    """GAIL with a discriminator of the sizes of the package's, which pays the logit alone."""
+
+    def __call__(self, batch):
+        return AdversarialUpdates.__call__(self, batch)  # without the absorbing state
 
     def discriminator(self, demos, preset, **options):
         network = OfNumbers(1, cells.DISCRIMINATOR_SIZES, keys.N_ACTIONS, activation_class=nn.ReLU)
@@ -60,7 +63,7 @@ def ours(seed: int) -> Tensor:
     images, actions = cells.demonstrated(seed)
     shown = ((f"{row}", image, "go there") for row, image in enumerate(images))
     seen = ActionDemonstrations(Demonstrations.from_episodes(shown), Truth(torch.cat(actions)))
-    adversary = SmallGAIL(seen, swapped=False, **cells.DISCRIMINATOR)
+    adversary = SmallGAIL(seen, swapped=False, prior=0.0, **cells.DISCRIMINATOR)
     policy = ProbabilisticActor(
         TensorDictModule(
             OfNumbers(keys.N_ACTIONS, cells.POLICY_SIZES), [keys.PIXELS], [keys.LOGITS]
