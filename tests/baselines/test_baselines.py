@@ -262,6 +262,12 @@ def test_updates_tell_demonstrations_from_the_policy(name, sources):
     assert gap > 0.5 and later["reward/loss_discriminator"] < metrics["reward/loss_discriminator"]
 
 
+def test_episodes_that_do_not_end_are_as_long_as_what_is_collected():
+    state = AbsorbingState(3.0, gamma=0.5)
+    state.count(TensorDict({"next": {"done": torch.zeros(2, 5, 1, dtype=torch.bool)}}, [2, 5]))
+    assert float(state.end) == pytest.approx((5 - 3) * math.log(2) / 0.5, rel=1e-5)
+
+
 def test_fewer_demonstrations_count_less_than_the_prior(sources):
     adversary = GAIfO(sources["frames"], prior=600.0, **SMALL)
     assert [group["weight_decay"] for group in adversary.optimizer.param_groups] == [50.0]

@@ -47,8 +47,8 @@ class AbsorbingState(nn.Module):
         self.register_buffer("end", torch.zeros(()))
 
     def count(self, batch: TensorDictBase) -> None:
-        """Measure the policy's episodes in collected steps [N, T]."""
-        own = batch.numel() / max(1, int(batch[keys.NEXT, "done"].sum()))
+        """Measure the policy's episodes in collected steps [N, T]; those that last longer count T."""
+        own = batch.numel() / max(len(batch), int(batch[keys.NEXT, "done"].sum()))
         among_steps = (1 - self.gamma**self.length) / (1 - self.gamma**own)
         self.step.fill_(math.log(among_steps))
         self.end.fill_((self.length - own) * math.log(self.gamma) / (1 - self.gamma))
