@@ -266,6 +266,9 @@ def test_episodes_that_do_not_end_are_as_long_as_what_is_collected():
     state = AbsorbingState(3.0, gamma=0.5)
     state.count(TensorDict({"next": {"done": torch.zeros(2, 5, 1, dtype=torch.bool)}}, [2, 5]))
     assert float(state.end) == pytest.approx((5 - 3) * math.log(2) / 0.5, rel=1e-5)
+    for gamma in (0.0, 1.0):
+        with pytest.raises(UserError, match="gamma must be above 0 and below 1"):
+            AbsorbingState(3.0, gamma)
 
 
 def test_fewer_demonstrations_count_less_than_the_prior(sources):

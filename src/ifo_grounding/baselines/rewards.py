@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ifo_grounding import keys
 from ifo_grounding.baselines.access import ENDED
+from ifo_grounding.errors import UserError
 from ifo_grounding.transforms.base import rows_of
 from ifo_grounding.transforms.reward import RewardTransform
 
@@ -26,7 +27,10 @@ class AbsorbingState(nn.Module):
 
     Args:
         length: mean number of steps of a demonstration.
-        gamma: discount, below 1.
+        gamma: discount.
+
+    Raises:
+        UserError: where the discount is 0 or 1: the state is then worth nothing, or without bounds.
 
     >>> state = AbsorbingState(5.0, gamma=0.9)
     >>> done = torch.tensor([[0, 1, 0, 1]]).bool().unsqueeze(-1)  # two episodes of two steps
@@ -42,6 +46,10 @@ class AbsorbingState(nn.Module):
 
     def __init__(self, length: float, gamma: float) -> None:
         super().__init__()
+        if not 0 < gamma < 1:
+            raise UserError(
+                f"gamma must be above 0 and below 1 for an absorbing state, got {gamma}"
+            )
         self.length, self.gamma = length, gamma
         self.register_buffer("step", torch.zeros(()))
         self.register_buffer("end", torch.zeros(()))
