@@ -55,7 +55,7 @@ class AbsorbingState(nn.Module):
         self.register_buffer("end", torch.zeros(()))
 
     def count(self, batch: TensorDictBase) -> None:
-        """Measure the policy's episodes in collected steps [N, T]; those that last longer count T."""
+        """Measure the policy's episodes in collected steps [N, T]; longer ones count T."""
         own = batch.numel() / max(len(batch), int(batch[keys.NEXT, "done"].sum()))
         among_steps = (1 - self.gamma**self.length) / (1 - self.gamma**own)
         self.step.fill_(math.log(among_steps))
