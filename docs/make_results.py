@@ -12,6 +12,7 @@ from pages import NOT_RUN, Row, Runs, chosen, difference, gain, ran, rate, read,
 
 from ifo_grounding.report import figure_png, markdown_table, rates_by_number, training_curves
 from ifo_grounding.report.results import brief
+from ifo_grounding.report.theme import PALETTE, add_legend
 from ifo_grounding.stats import Rate, holm
 from ifo_grounding.tasks import TASKS
 
@@ -220,7 +221,7 @@ def mean_curve(runs: Runs) -> dict[int, float]:
 
 def baseline_curves() -> bytes:
     """Draw the curves of methods that learn by policy gradient, where one of them gets far."""
-    rows, panels = [], {}
+    rows, panels, drawn = [], {}, set()
     for key, found in by_method().items():
         title, means = title_of(*key), {m: mean_curve(runs) for m, runs in found.items()}
         if all(share < 0.1 for mean in means.values() for share in mean.values()):
@@ -228,10 +229,16 @@ def baseline_curves() -> bytes:
         panels[title] = {f"{title} {method}": method for method in means}
         for method, mean in means.items():
             rows += [{"step": frames, f"{title} {method}": mean[frames]} for frames in mean]
+            drawn |= {method} if mean else set()
     figure = training_curves(sorted(rows, key=lambda row: row["step"]), panels)
+    colours = dict(zip((method for method in USES if method in drawn), PALETTE, strict=False))
     for axes in figure.axes:
         axes.set_ylim(-0.05, 1.05)
         axes.set_xlabel("frames")
+        for line in axes.lines:
+            line.set_color(colours[str(line.get_label())])
+        if axes.lines:  # not the empty place of the last row
+            add_legend(axes, loc="best")
     return figure_png(figure)
 
 

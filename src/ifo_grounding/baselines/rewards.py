@@ -32,6 +32,7 @@ class AbsorbingState(nn.Module):
     Raises:
         UserError: where the discount is 0 or 1: the state is then worth nothing, or without bounds.
 
+    >>> from tensordict import TensorDict
     >>> state = AbsorbingState(5.0, gamma=0.9)
     >>> done = torch.tensor([[0, 1, 0, 1]]).bool().unsqueeze(-1)  # two episodes of two steps
     >>> state.count(TensorDict({"next": {"done": done}}, [1, 4]))
