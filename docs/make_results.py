@@ -221,16 +221,17 @@ def mean_curve(runs: Runs) -> dict[int, float]:
 
 def baseline_curves() -> bytes:
     """Draw the curves of methods that learn by policy gradient, where one of them gets far."""
-    rows, panels, drawn = [], {}, set()
+    rows, panels = [], {}
     for key, found in by_method().items():
         title, means = title_of(*key), {m: mean_curve(runs) for m, runs in found.items()}
+        means = {method: mean for method, mean in means.items() if mean}
         if all(share < 0.1 for mean in means.values() for share in mean.values()):
             continue
         panels[title] = {f"{title} {method}": method for method in means}
         for method, mean in means.items():
             rows += [{"step": frames, f"{title} {method}": mean[frames]} for frames in mean]
-            drawn |= {method} if mean else set()
     figure = training_curves(sorted(rows, key=lambda row: row["step"]), panels)
+    drawn = {method for panel in panels.values() for method in panel.values()}
     colours = dict(zip((method for method in USES if method in drawn), PALETTE, strict=False))
     for axes in figure.axes:
         axes.set_ylim(-0.05, 1.05)
