@@ -36,6 +36,8 @@ WANTED = {
 """Pieces that each table and figure of the paper is made from; the first has phase 1."""
 FIRST = {"zero-shot-pairs-5000": "zero-shot", "pairs-5000": "phase-1", "pairs-10000": "phase-1"}
 """The piece that another begins with."""
+BEHIND_PHASE_1 = ("self_examine.", "baseline.")
+"""How options begin that change nothing of phase 1."""
 
 
 @dataclass
@@ -171,8 +173,12 @@ def of_phase(
 def of_methods(
     options: ReproduceOptions, seed: int, n: int, preset: str, task: str
 ) -> Iterator[Piece]:
-    """Yield a piece for each method of Table 1, of one run, or for each trial, of a run each."""
+    """Yield a piece for each method of Table 1, of one run, or for each trial, of a run each.
+
+    Trials of what comes behind phase 1 begin with the phase 1 of the first of them.
+    """
     name = f"{task}-{n}-{preset}"
+    base = None
     of_run = {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n, **options.method}
     for method in options.tuning if options.tune else METHODS:
         if method == "lc-rl" and task not in PLANNED:
@@ -182,12 +188,17 @@ def of_methods(
             yield piece(options, run, file, of_run, {"method": method}, recipe="baselines")
             continue
         space = options.tuning[method]
+        behind = all(option.startswith(BEHIND_PHASE_1) for option in space)
         for number, values in enumerate(product(*space.values())):
             run = f"tuning-{name}-{method}-{number}-seed{seed}"
             file = f"tuning/{name}-trial{number}-{method}-seed{seed}.json"
+            begins = base if behind else None
             trial = {"method": method, "variant": f"trial{number}"}
+            trial |= {"base": begins} if begins else {}
             trial |= zip(space, values, strict=True)
-            yield piece(options, run, file, of_run, options.tuned, trial, recipe="baselines")
+            chosen = (of_run, options.tuned, trial)
+            yield piece(options, run, file, *chosen, base=begins, recipe="baselines")
+            base = run if behind and not base else base
 
 
 def of_level(options: ReproduceOptions, seed: int, n: int, level: str) -> Piece:
@@ -223,7 +234,7 @@ def to_make(chain: list[Piece]) -> list[Piece]:
     """
     missing = [piece for piece in chain if not piece.file.exists()]
     bases = {piece.base for piece in missing if Run(piece.call.run).options() is None}
-    gone = {base for base in bases if base and not Run(base).record("evaluate")}
+    gone = {base for base in bases if base and not (Run(base) / "result.json").exists()}
     return [piece for piece in chain if piece in missing or piece.call.run in gone]
 
 

@@ -182,7 +182,7 @@ def first(tmp_path):
     """A run of two finished stages."""
     run = Run(tmp_path / "first")
     run.begin(OPTIONS)
-    for name in ("imitate", "self_examine"):
+    for name in ("imitate", "self_examine", "evaluate_ours"):
         run.stage(name).finish({"of": name}, [])
         Checkpoint(run / "checkpoints" / f"{name}.pt", {}).save({})
     for name in ("logs/a.csv", "report/index.html", "policy.safetensors", ".lock"):
@@ -194,7 +194,7 @@ def first(tmp_path):
 def test_a_run_takes_over_what_another_has_finished_into_a_folder_of_none(tmp_path, first):
     second = Run(tmp_path / "second")
     with second.lock():
-        second.take_over(first, without=["self_examine", "other.safetensors"])
+        second.take_over(first, without=["self_examine", "evaluate_*", "other.safetensors"])
     taken = {str(path.relative_to(second.folder)) for path in second.folder.rglob("[!.]*.*")}
     assert taken == {"stages/imitate.json", "metrics/imitate.json", "policy.safetensors"}
     assert second.options() is None

@@ -220,7 +220,7 @@ class Run:
         """Copy what another run has finished, but for its options, unless this one has begun.
 
         Args:
-            without: names of stages and files that this run is to make anew.
+            without: patterns of names of stages and files that this run is to make anew.
 
         Raises:
             UserError: where the other run does not exist, or this folder holds what is no run's.
