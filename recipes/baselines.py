@@ -227,6 +227,8 @@ def adversarial(options: Options, stage: Stage) -> None:
         begun = load_network(run, REFERENCE, options)
     policy = new_policy(options, options.seed) if begun is None else begun
     value = build(make_value, options, init_from=policy)
+    practice = practice_of(options)
+    worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
     seen, more = access(options, run), options.networks.changed()
     if method == "gaifo":
         more["inverse"] = load_network(run, INVERSE, options)
@@ -235,7 +237,7 @@ def adversarial(options: Options, stage: Stage) -> None:
         options.preset,
         steps=section.steps,
         lr=section.lr,
-        gamma=options.self_examine.gamma,
+        gamma=practice.gamma,
         stop_action=world.stop_action,
         shapes=policy.network_config.shapes,
         seed=options.seed,
@@ -244,8 +246,6 @@ def adversarial(options: Options, stage: Stage) -> None:
     )
     read_fast(adversary.demonstrations, options)
     reading_codes(adversary.network, options)
-    practice = windows_of(options)
-    worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
     config = replace(
         practice,
         iterations=math.ceil(section.frames / rounds),
@@ -277,13 +277,15 @@ def adversarial(options: Options, stage: Stage) -> None:
     finish(options, stage, {"of": plain(section), **history[-1]}, history)
 
 
-def windows_of(options: Options) -> Any:
+def practice_of(options: Options) -> Any:
     """Return the settings of phase 2, with as many frames per iteration in longer windows."""
     practice = options.self_examine
-    if options.method in ("agile", "agile-chosen"):  # paid at the stop alone
-        return practice
-    worlds = math.ceil(practice.num_envs * practice.steps / WINDOW)
-    return replace(practice, num_envs=worlds, steps=WINDOW)
+    worlds, steps = practice.num_envs, practice.steps
+    if options.method not in ("agile", "agile-chosen"):  # which are paid at the stop alone
+        worlds, steps = math.ceil(worlds * steps / WINDOW), WINDOW
+    if practice.gamma == 0:  # preset=paper: for a reward that says of each action what it is worth
+        return type(practice)(num_envs=worlds, steps=steps)
+    return replace(practice, num_envs=worlds, steps=steps)
 
 
 def access(options: Options, run: Run) -> Any:

@@ -71,6 +71,16 @@ def test_a_rival_has_the_policy_of_the_run(options, tmp_path):
     assert policy.network_config.config.context == 1
 
 
+def test_where_phase_2_has_no_discount_a_rival_learns_by_the_defaults(options, tmp_path):
+    from baselines import baseline, practice_of
+
+    given = options(*FEWER, "preset=paper", "method=agile", run="paper")
+    assert given.self_examine.gamma == 0
+    practice = practice_of(given)
+    assert (practice.algorithm, practice.gamma, practice.steps) == ("ppo", 0.99, 10)
+    assert 0 <= baseline(given)["agile"]["rate"]["rate"] <= 1
+
+
 def test_a_rival_that_needs_what_a_world_lacks_says_so(practised, options, tmp_path):
     from baselines import baseline
 
