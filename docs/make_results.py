@@ -8,7 +8,22 @@ from statistics import fmean, median
 import make_speed
 import make_tables
 from make_tables import TABLE_2, pieces
-from pages import NOT_RUN, Row, Runs, chosen, difference, gain, ran, rate, read, success, write
+from omegaconf import OmegaConf
+from pages import (
+    NOT_RUN,
+    ROOT,
+    Row,
+    Runs,
+    chosen,
+    difference,
+    gain,
+    percent,
+    ran,
+    rate,
+    read,
+    success,
+    write,
+)
 
 from ifo_grounding.report import figure_png, markdown_table, rates_by_number, training_curves
 from ifo_grounding.report.results import brief
@@ -167,6 +182,26 @@ def own_seeds(methods: dict[str, Runs], method: str) -> str:
     return "" if more_seeds(*methods.values()) else more_seeds(methods[method])
 
 
+def trial_rows() -> list[Row]:
+    """Return how often each trial of a method of Table 1 succeeds on validation scenes."""
+    space = OmegaConf.load(ROOT / "recipes/conf/reproduce.yaml").tuning
+    found = read("tuning", lambda options: (options["method"], options["variant"]))
+    rows = []
+    for method in USES:
+        trials = [runs for (of, _), runs in found.items() if of == method]
+        if not trials:
+            continue
+        ((option, values),) = space[method].items()
+        section, name = option.split(".")
+        shares = {r[0]["options"][section][name]: rate(r, method).rate for r in trials}
+        best = max(shares, key=lambda value: shares[value])
+        shown = [f"{value:g}: {percent([shares[value]])}" for value in values if value in shares]
+        shown = [f"**{text}**" if text.startswith(f"{best:g}:") else text for text in shown]
+        row = {"method": f"`{method}`", "option": f"`{option}`", "trials": ", ".join(shown)}
+        rows.append(row)
+    return rows
+
+
 def ahead_rows() -> list[Row]:
     """Return how far ours is ahead of the best rival, and of which it is not; p by Holm."""
     rows = []
@@ -263,6 +298,7 @@ def tables() -> dict[str, str]:
         "baselines": baseline_rows(few=True),
         "baselines-more": baseline_rows(few=False),
         "ours-ahead": ahead_rows(),
+        "trials": trial_rows(),
         "peers": peer_rows(),
     }
     here = {name: markdown_table(rows) for name, rows in found.items()}

@@ -154,15 +154,16 @@ class Adversary(AdversarialUpdates):
         self.stop_action, demos = stop_action, frames_of(seen)
         self.network = self.discriminator(shapes or demos, preset, **options)
         loss = DiscriminatorLoss(self.network, spare=self.spare, swapped=swapped)
+        self.reward = self.paid(demos, gamma)
         # Part of the loss, so that a checkpoint holds what it has counted.
-        loss.absorbing = AbsorbingState(float(demos.lengths.float().mean()) - 1, gamma)
-        self.reward = self.paid(loss.absorbing)
+        loss.absorbing = getattr(self.reward, "absorbing", None)
         decay = prior / len(demos)
         super().__init__(loss, self.demonstrated(seen), steps, lr, batch_size, decay)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Count the policy's steps [N, T], train on them, and return mean metrics."""
-        self.loss.absorbing.count(batch)
+        if self.loss.absorbing is not None:
+            self.loss.absorbing.count(batch)
         return super().__call__(batch)
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:
@@ -173,8 +174,9 @@ class Adversary(AdversarialUpdates):
         """Return the network."""
         raise NotImplementedError
 
-    def paid(self, absorbing: AbsorbingState) -> RewardTransform:
+    def paid(self, demos: Demonstrations, gamma: float) -> RewardTransform:
         """Return the transform that pays."""
+        absorbing = AbsorbingState(float(demos.lengths.float().mean()) - 1, gamma)
         return DiscriminatorReward(self.network, absorbing)
 
 
@@ -257,7 +259,7 @@ class AGILE(Adversary):
         in_keys = (keys.NEXT_PIXELS, keys.INSTRUCTION)
         return make_instruction_classifier(shapes, preset, in_keys=in_keys, **options)
 
-    def paid(self, absorbing: AbsorbingState) -> DiscriminatorReward:  # noqa: D102
+    def paid(self, demos: Demonstrations, gamma: float) -> RewardTransform:  # noqa: D102
         if self.stop_action is None:
             raise UserError(
                 "AGILE is paid at the stop, and this world has none: give world.stop=add"
