@@ -88,9 +88,8 @@ def baseline(options: Options) -> dict[str, Any]:
     if stage.result is not None:
         return stage.result["results"]
     results = measured(learned, options)
-    if curve := stage.run.metrics(f"baseline_{options.method}"):
-        wanted = [row for row in curve if "success" in row]
-        results["curve"] = [[row["trained_frames"], row["success"]] for row in wanted]
+    if curve := learning_curve(stage.run, options.method):
+        results["curve"] = curve
     finish(options, stage, {"of": asked, "results": results})
     return results
 
@@ -106,6 +105,16 @@ def measured(learned: Any, options: Options) -> dict[str, Any]:
         of = {"seed": scenes.seed, "stream": scenes.stream}
         return {options.method: by_scene(world_of(options).demonstrator(scenes.episodes, **of))}
     return success_results(measured_success({options.method: learned}, options))
+
+
+def learning_curve(run: Run, method: str) -> list[list[float]]:
+    """Return pairs of frames and success on validation scenes, of methods by policy gradient."""
+    found, frames = [], 0.0
+    for row in run.metrics("self_examine" if method == "ours" else f"baseline_{method}"):
+        frames += row.get("frames", 0)
+        if "success" in row:
+            found.append([frames, row["success"]])
+    return found
 
 
 def trained(options: Options) -> Any:
@@ -222,10 +231,8 @@ def adversarial(options: Options, stage: Stage) -> None:
     """Train a policy against a discriminator; see :mod:`ifo_grounding.baselines`."""
     method, section = options.method, options.baseline
     run, world = stage.run, world_of(options)
-    begun = None
-    if method == "gail+bc":
-        begun = load_network(run, REFERENCE, options)
-    policy = new_policy(options, options.seed) if begun is None else begun
+    begun = method == "gail+bc"
+    policy = load_network(run, REFERENCE, options) if begun else new_policy(options, options.seed)
     value = build(make_value, options, init_from=policy)
     practice = practice_of(options)
     worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
@@ -251,7 +258,7 @@ def adversarial(options: Options, stage: Stage) -> None:
         iterations=math.ceil(section.frames / rounds),
         anneal=False,  # the reward goes on changing
         entropy=ENTROPY,
-        value_warmup=0 if begun is None else practice.value_warmup,
+        value_warmup=practice.value_warmup if begun else 0,
         select_every=0,
         evaluate_every=max(1, math.ceil(section.frames / rounds / 20)),
     )
@@ -269,7 +276,7 @@ def adversarial(options: Options, stage: Stage) -> None:
         checkpoint=stage.checkpoint,
         checkpoint_seconds=options.checkpoint_seconds,
         log=stage.log(),
-        callback=validation_success(policy, rounds, options),
+        callback=validation_success(policy, options),
         progress=options.progress,
         cudagraph=True,
     )
@@ -303,15 +310,10 @@ def access(options: Options, run: Run) -> Any:
     return demos
 
 
-def validation_success(policy: Any, frames: int, options: Options) -> Any:
+def validation_success(policy: Any, options: Options) -> Any:
     """Return what measures the greedy policy on validation scenes, for the curve alone."""
     env, shown = played(options, options.evaluate.audit_episodes, stream="validation", split="all")
-
-    def measure(step: int) -> dict[str, float]:
-        success = success_rate(policy, env, **shown).rate
-        return {"success": success.rate, "trained_frames": float(step * frames)}
-
-    return measure
+    return lambda step: {"success": success_rate(policy, env, **shown).rate.rate}
 
 
 @recipe_main

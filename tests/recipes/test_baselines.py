@@ -38,6 +38,8 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
     given = options(*FEWER, f"method={method}")
     results = baseline(given)
     assert 0 <= results[method]["rate"]["rate"] <= 1 and results[method]["rate"]["count"] == 20
+    if method == "ours":
+        assert [frames for frames, _ in results["curve"]] == [80, 160]
     trained = run / "stages" / f"baseline_{method}.json"
     if trained.exists():
         found = read_json(trained)["result"]
