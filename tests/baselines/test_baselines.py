@@ -276,6 +276,13 @@ def test_fewer_demonstrations_count_less_than_the_prior(sources):
     assert [group["weight_decay"] for group in adversary.optimizer.param_groups] == [50.0]
 
 
+def test_a_method_has_a_learning_rate_of_its_own(sources):
+    def rate_of(**given):
+        return GAIfO(sources["frames"], **SMALL, **given).optimizer.param_groups[0]["lr"]
+
+    assert (rate_of(), rate_of(lr=0.5)) == (3e-4, 0.5)
+
+
 def test_agile_needs_a_stop(sources):
     with pytest.raises(UserError, match="paid at the stop"):
         AGILE(sources["steps"], stop_action=None, **SMALL)

@@ -136,13 +136,14 @@ def test_every_method_of_table_1_is_tuned_by_as_many_trials(reproduce_options):
     for piece in of_strong:
         given = dict(word.split("=", 1) for word in piece.call.options)
         trials[given["method"]].append(given)
+    alike = ("random", "expert", "gail+bc", "agile-chosen")
     counts = {method: len(each) for method, each in trials.items()}
-    assert counts == dict.fromkeys(METHODS, 3) | {"random": 0, "expert": 0}
+    assert counts == dict.fromkeys(METHODS, 3) | dict.fromkeys(alike, 0)
     assert (
-        len({each.call.run for each in of_strong}) == len({each.file for each in of_strong}) == 30
+        len({each.call.run for each in of_strong}) == len({each.file for each in of_strong}) == 24
     )
     assert all("evaluate.stream=validation" in piece.call.options for piece in of_strong)
-    assert [float(t["baseline.lr"]) for t in trials["gail"]] == [3e-4, 1e-3, 3e-3]
+    assert [float(t["baseline.lr"]) for t in trials["gail"]] == [1e-3, 3e-3, 1e-2]
     (first, *_), imitated = of_strong, ("bc", "bco")  # which choose settings of phase 1 itself
     for piece in of_strong[1:]:
         own = dict(word.split("=", 1) for word in piece.call.options)["method"] in imitated

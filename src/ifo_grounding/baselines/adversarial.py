@@ -116,6 +116,7 @@ class Adversary(AdversarialUpdates):
         seen: what the method may use; another kind is refused.
         preset: of the network.
         steps: gradient steps after each iteration.
+        lr: learning rate; by default that of the method.
         prior: weight decay times demonstrations, as of
             :class:`~ifo_grounding.training.FitConfig`.
         gamma: discount of the policy gradient.
@@ -132,6 +133,8 @@ class Adversary(AdversarialUpdates):
     """What the method may use."""
     spare = 0.0
     """Share of the policy's steps that is left out."""
+    lr = 1e-3
+    """Learning rate of the discriminator by default, the best of three on validation scenes."""
     network: TensorDictModule
     reward: RewardTransform
 
@@ -141,7 +144,7 @@ class Adversary(AdversarialUpdates):
         preset: str = "strong",
         *,
         steps: int = 10,
-        lr: float = 3e-4,
+        lr: float | None = None,
         batch_size: int = 256,
         swapped: bool = True,
         prior: float = 800.0,
@@ -158,7 +161,7 @@ class Adversary(AdversarialUpdates):
         # Part of the loss, so that a checkpoint holds what it has counted.
         loss.absorbing = getattr(self.reward, "absorbing", None)
         decay = prior / len(demos)
-        super().__init__(loss, self.demonstrated(seen), steps, lr, batch_size, decay)
+        super().__init__(loss, self.demonstrated(seen), steps, lr or self.lr, batch_size, decay)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Count the policy's steps [N, T], train on them, and return mean metrics."""
@@ -230,6 +233,7 @@ class GAIfO(Adversary):
     """
 
     access: type[Any] = Demonstrations
+    lr = 3e-4
 
     def demonstrated(self, seen: Demonstrations) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(seen)

@@ -33,8 +33,8 @@ class BaselineConfig:
     """Steps of the simulator that the policy learns from."""
     steps: int = 10
     """Gradient steps of the discriminator after each iteration."""
-    lr: float = 3e-4
-    """Learning rate of the discriminator."""
+    lr: float | None = None
+    """Learning rate of the discriminator; by default the method's own."""
     alpha: float = 1.0
     """Of ``bco-alpha``: steps of the policy, by the number of random steps, from which the inverse
     model learns on."""
