@@ -133,7 +133,7 @@ class Adversary(AdversarialUpdates):
     """What the method may use."""
     spare = 0.0
     """Share of the policy's steps that is left out."""
-    lr = 1e-3
+    lr: float
     """Learning rate of the discriminator by default, the best of three on validation scenes."""
     network: TensorDictModule
     reward: RewardTransform
@@ -187,6 +187,7 @@ class GAIL(Adversary):
     """Tells demonstrated actions from the policy's: state, instruction, action."""
 
     access: type[Any] = ActionDemonstrations
+    lr = 3e-3
 
     def demonstrated(self, seen: ActionDemonstrations) -> TensorDictReplayBuffer:  # noqa: D102
         return seen.transitions()
@@ -255,6 +256,7 @@ class AGILE(Adversary):
 
     access: type[Any] = SteppableDemonstrations
     spare = 0.75
+    lr = 1e-3
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(frames_of(seen), last=True)
