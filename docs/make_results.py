@@ -194,10 +194,10 @@ def trial_rows() -> list[Row]:
         ((option, values),) = space[method].items()
         section, name = option.split(".")
         shares = {r[0]["options"][section][name]: rate(r, method).rate for r in trials}
-        best = max(shares, key=lambda value: shares[value])
-        shown = [f"{value:g}: {percent([shares[value]])}" for value in values if value in shares]
-        shown = [f"**{text}**" if text.startswith(f"{best:g}:") else text for text in shown]
-        row = {"method": f"`{method}`", "option": f"`{option}`", "trials": ", ".join(shown)}
+        best = max(shares.values())
+        shown = {value: f"{value:g}: {percent([shares[value]])}" for value in values}
+        texts = (f"**{text}**" if shares[value] == best else text for value, text in shown.items())
+        row = {"method": f"`{method}`", "option": f"`{option}`", "trials": ", ".join(texts)}
         rows.append(row)
     return rows
 

@@ -180,6 +180,7 @@ def of_methods(
     name = f"{task}-{n}-{preset}"
     base = None
     of_run = {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n, **options.method}
+    of_run["world"] = options.preset[preset].get("world", {})
     for method in options.tuning if options.tune else METHODS:
         if method == "lc-rl" and task not in PLANNED:
             continue

@@ -123,6 +123,8 @@ def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_pa
         assert first.run == last.run and first.seed == 3
         assert (first.budget, first.evaluate.episodes) == (budget, 5000)
     assert chains[0][0].file == tmp_path / "results/baselines/move-200-strong-bc-seed3.json"
+    (of_paper, *_) = pieces(reproduce_options("table=1", "tasks=[move]", "presets=[paper]"))
+    assert options_of(*of_paper[0].call.options).world["tile_size"] == 16  # as of other tables
 
 
 def test_every_method_of_table_1_is_tuned_by_as_many_trials(reproduce_options):
