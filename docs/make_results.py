@@ -286,7 +286,7 @@ def baseline_curves() -> bytes:
             legend.remove()
     lines = {str(line.get_label()): line for axes in figure.axes for line in axes.lines}
     shown = [lines[method] for method in colours]
-    add_legend(figure, handles=shown, loc="outside lower center", ncols=len(shown))
+    add_legend(figure, handles=shown, loc="outside lower left", ncols=3)
     return figure_png(figure)
 
 
