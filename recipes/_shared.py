@@ -48,7 +48,7 @@ MADE_BY = {
 """The recipe that trains each network, and its stage where that has another name."""
 CHECKSUMS = "networks.json"  # of the networks that the run has trained, by file
 OF_PHASE_2 = (
-    *("self_examine", "continue_imitation", "evaluate", "evaluate_*", "baseline_*"),
+    *("self_examine", "continue_imitation", "evaluate*", "baseline_*"),
     *(POLICIES["phase2"], CONTINUED, VALUE, PAIRS),
 )
 """Patterns of stages and files that a run makes anew where it takes over another's phase 1."""

@@ -291,7 +291,7 @@ def practice_of(options: Options) -> Any:
     if options.method not in ("agile", "agile-chosen"):  # which are paid at the stop alone
         worlds, steps = math.ceil(worlds * steps / WINDOW), WINDOW
     if practice.gamma == 0:  # preset=paper: for a reward that says of each action what it is worth
-        return type(practice)(num_envs=worlds, steps=steps)
+        practice = type(practice)()
     return replace(practice, num_envs=worlds, steps=steps)
 
 

@@ -161,7 +161,7 @@ def of_phase(
         name.format(phase),
         f"tables/{task}-{n}-{preset}-{phase}-seed{seed}.json",
         {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n},
-        {"variant": phase, **({"base": base} if base else {})},
+        {"variant": phase},
         options.all,
         options.preset[preset],
         options.preset_of_task.get(preset, {}).get(task, {}),
@@ -193,13 +193,13 @@ def of_methods(
         for number, values in enumerate(product(*space.values())):
             run = f"tuning-{name}-{method}-{number}-seed{seed}"
             file = f"tuning/{name}-trial{number}-{method}-seed{seed}.json"
-            begins = base if behind else None
             trial = {"method": method, "variant": f"trial{number}"}
-            trial |= {"base": begins} if begins else {}
             trial |= zip(space, values, strict=True)
             chosen = (of_run, options.tuned, trial)
-            yield piece(options, run, file, *chosen, base=begins, recipe="baselines")
-            base = run if behind and not base else base
+            begun = base if behind else None
+            yield piece(options, run, file, *chosen, base=begun, recipe="baselines")
+            if behind:
+                base = base or run
 
 
 def of_level(options: ReproduceOptions, seed: int, n: int, level: str) -> Piece:
@@ -220,6 +220,8 @@ def piece(
     """Return the piece of some options, later ones first where they differ."""
     path = Path(options.results) / file
     given = {"run": run, "results": str(path.parent), "device": options.device}
+    if base:
+        given["base"] = base
     for section in chosen:
         given |= leaves(section)
     words = tuple(f"{name}={written(value)}" for name, value in given.items())
