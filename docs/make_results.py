@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import cache
 from itertools import chain
 from statistics import fmean, median
+from typing import Any
 
 import make_speed
 import make_tables
@@ -132,30 +133,39 @@ USES = {
     "random": "",
 }
 """Methods of Table 1, and what they use beside frames and instructions."""
+FEW = (200, "strong", "")
+"""What runs of every task share in the first table of Table 1."""
 PEERS = ("ours", "imitation", "imitation, own reward")
 """What learns GAIL in `benchmarks/gail.py`."""
 
 
+Made = tuple[str, int, str, str]
+"""What runs of Table 1 share: task, number of demonstrations, preset and, where they were more,
+frames."""
+
+
 @cache
-def by_method() -> dict[tuple[str, int, str], dict[str, Runs]]:
-    """Return the runs of each method of Table 1 by task, number of demonstrations and preset."""
-    found = read(
-        "baselines", lambda o: (o["task"], o["demonstrations"]["n"], o["preset"], o["method"])
-    )
-    sets = sorted(
-        {key[:3] for key in found}, key=lambda key: (TASKS.index(key[0]), -key[1], key[2])
-    )
-    return {key: {m: found[(*key, m)] for m in USES if (*key, m) in found} for key in sets}
+def by_method() -> dict[Made, dict[str, Runs]]:
+    """Return the runs of each method of Table 1 by what they share."""
+
+    def made(options: dict[str, Any]) -> Made:
+        frames = options["variant"].removesuffix(options["method"]).removesuffix("-")
+        return options["task"], options["demonstrations"]["n"], options["preset"], frames
+
+    found = read("baselines", lambda options: (made(options), options["method"]))
+    sets = sorted({key for key, _ in found}, key=lambda key: (TASKS.index(key[0]), -key[1], *key))
+    return {key: {m: found[key, m] for m in USES if (key, m) in found} for key in sets}
 
 
-def title_of(task: str, number: int, preset: str) -> str:
+def title_of(task: str, number: int, preset: str, frames: str = "") -> str:
     """Return the name of a set of runs."""
-    return f"{task} {number:,}" + ("" if preset == "strong" else f", preset `{preset}`")
+    said = ("" if preset == "strong" else f"preset `{preset}`", frames and f"{frames} frames")
+    return ", ".join(filter(None, (f"{task} {number:,}", *said)))
 
 
 def baseline_rows(few: bool) -> list[Row]:
     """Return a row for each method of Table 1: every task with 200, or what else ran."""
-    found = {k: v for k, v in by_method().items() if (k[1:] == (200, "strong")) == few}
+    found = {k: v for k, v in by_method().items() if (k[1:] == FEW) == few}
     return [
         {"method": f"`{method}`" + (f": {used}" if used else "")}
         | {
@@ -211,7 +221,7 @@ def ahead_rows() -> list[Row]:
         both = {method: runs for method, runs in both.items() if runs}
         if both:
             rows.append(ahead_row(title_of(*key) + more_seeds(*found.values()), both))
-        if key[1:] == (200, "strong"):
+        if key[1:] == FEW:
             for method, runs in both.items():
                 of_tasks.setdefault(method, []).append(runs)
     of_all = {m: [*chain(*of)] for m, of in of_tasks.items() if len(of) == len(TASKS)}
@@ -263,10 +273,11 @@ def mean_curve(runs: Runs) -> dict[int, float]:
 
 def baseline_curves() -> bytes:
     """Draw the curves of methods that learn by policy gradient, where one of them gets far."""
-    rows, panels = [], {}
-    for key, found in by_method().items():
-        title, means = title_of(*key), {m: mean_curve(runs) for m, runs in found.items()}
-        means = {method: mean for method, mean in means.items() if mean}
+    rows, panels, curves = [], {}, dict[str, dict[str, dict[int, float]]]()
+    for key, found in by_method().items():  # more frames come behind fewer
+        means = {method: mean for method, runs in found.items() if (mean := mean_curve(runs))}
+        curves.setdefault(title_of(*key[:3]), {}).update(means)
+    for title, means in curves.items():
         if all(share < 0.1 for mean in means.values() for share in mean.values()):
             continue
         panels[title] = {f"{title} {method}": method for method in means}

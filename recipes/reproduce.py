@@ -59,6 +59,10 @@ class ReproduceOptions:
     demonstrations: list[int] = field(default_factory=list)
     """Of each piece: by default 80,000, of Table 1 200, 2,000 and 20,000, of BabyAI 1,000 and
     5,000."""
+    methods: list[str] = field(default_factory=lambda: list(METHODS))
+    """Of Table 1: which methods."""
+    frames: int = 600_000
+    """Of Table 1: steps of the simulator that adversarial methods learn from."""
     jobs: int = 2
     """Chains of pieces side by side, each on one thread."""
     ray: bool = False
@@ -99,6 +103,8 @@ class ReproduceOptions:
             check_choice("task", task, TASKS)
         for preset in self.presets:
             check_choice("preset", preset, ("strong", "paper"))
+        for method in self.methods:
+            check_choice("method", method, METHODS)
         if self.jobs < 1:
             raise UserError(f"jobs must be at least 1, got {self.jobs}")
 
@@ -178,11 +184,14 @@ def of_methods(
     Trials of what comes behind phase 1 begin with the phase 1 of the first of them.
     """
     name = f"{task}-{n}-{preset}"
-    base = None
     of_run = {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n, **options.method}
-    of_run["world"] = options.preset[preset].get("world", {})
+    of_run |= {"baseline.frames": options.frames, "world": options.preset[preset].get("world", {})}
+    if options.frames != ReproduceOptions.frames and not options.tune:
+        of_run["variant"] = f"{options.frames / 1e6:g}M"
+        name += f"-{of_run['variant']}"
+    base = None
     for method in options.tuning if options.tune else METHODS:
-        if method == "lc-rl" and task not in PLANNED:
+        if method not in options.methods or (method == "lc-rl" and task not in PLANNED):
             continue
         if not options.tune:
             run, file = f"baselines-{name}-seed{seed}", f"baselines/{name}-{method}-seed{seed}.json"

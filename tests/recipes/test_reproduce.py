@@ -127,6 +127,22 @@ def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_pa
     assert options_of(*of_paper[0].call.options).world["tile_size"] == 16  # as of other tables
 
 
+def test_table_1_of_some_methods_with_more_frames_has_files_of_its_own(reproduce_options, tmp_path):
+    from reproduce import pieces
+
+    asked = ("table=1", "tasks=[pick]", "demonstrations=[200]", "presets=[strong]")
+    ((gail, agile),) = pieces(
+        reproduce_options(*asked, "methods=[agile,gail]", "frames=2000000", "seeds=[1]")
+    )
+    assert gail.file == tmp_path / "results/baselines/pick-200-strong-2M-gail-seed1.json"
+    assert gail.call.run == agile.call.run == "baselines-pick-200-strong-2M-seed1"
+    options = options_of(*gail.call.options)
+    assert (options.baseline.frames, options.method) == (2_000_000, "gail")
+    assert options.variant == "2M"
+    with pytest.raises(UserError, match="unknown method 'gial'"):
+        reproduce_options(*asked, "methods=[gial]")
+
+
 def test_every_method_of_table_1_is_tuned_by_as_many_trials(reproduce_options):
     from reproduce import pieces
 
