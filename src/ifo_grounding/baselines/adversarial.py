@@ -161,7 +161,8 @@ class Adversary(AdversarialUpdates):
         # Part of the loss, so that a checkpoint holds what it has counted.
         loss.absorbing = getattr(self.reward, "absorbing", None)
         decay = prior / len(demos)
-        super().__init__(loss, self.demonstrated(seen), steps, lr or self.lr, batch_size, decay)
+        rate = self.lr if lr is None else lr
+        super().__init__(loss, self.demonstrated(seen), steps, rate, batch_size, decay)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Count the policy's steps [N, T], train on them, and return mean metrics."""
