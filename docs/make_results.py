@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
-from itertools import chain
+from itertools import chain, product
 from statistics import fmean, median
 from typing import Any
 
@@ -153,7 +153,8 @@ def by_method() -> dict[Made, dict[str, Runs]]:
         return options["task"], options["demonstrations"]["n"], options["preset"], frames
 
     found = read("baselines", lambda options: (made(options), options["method"]))
-    sets = sorted({key for key, _ in found}, key=lambda key: (TASKS.index(key[0]), -key[1], *key))
+    order = {key: (TASKS.index(key[0]), key[2] != "strong", *key) for key, _ in found}
+    sets = sorted(order, key=order.__getitem__)
     return {key: {m: found[key, m] for m in USES if (key, m) in found} for key in sets}
 
 
@@ -272,14 +273,13 @@ def mean_curve(runs: Runs) -> dict[int, float]:
 
 
 def baseline_curves() -> bytes:
-    """Draw the curves of methods that learn by policy gradient, where one of them gets far."""
-    rows, panels, curves = [], {}, dict[str, dict[str, dict[int, float]]]()
-    for key, found in by_method().items():  # more frames come behind fewer
-        means = {method: mean for method, runs in found.items() if (mean := mean_curve(runs))}
-        curves.setdefault(title_of(*key[:3]), {}).update(means)
-    for title, means in curves.items():
-        if all(share < 0.1 for mean in means.values() for share in mean.values()):
-            continue
+    """Draw the curves of methods that learn by policy gradient, of the most frames that ran."""
+    rows, panels = [], {}
+    for task, number in product(("move", "move-udlr", "pick"), (200, 2000)):
+        key, means = (task, number, "strong"), {}
+        for found in (runs for made, runs in by_method().items() if made[:3] == key):
+            means |= {m: mean for m, runs in found.items() if (mean := mean_curve(runs))}
+        title = title_of(*key)
         panels[title] = {f"{title} {method}": method for method in means}
         for method, mean in means.items():
             rows += [{"step": frames, f"{title} {method}": mean[frames]} for frames in mean]
@@ -287,7 +287,7 @@ def baseline_curves() -> bytes:
     drawn = {method for panel in panels.values() for method in panel.values()}
     colours = dict(zip((method for method in USES if method in drawn), PALETTE, strict=False))
     for axes in figure.axes[: len(panels)]:
-        axes.set_xlim(0)
+        axes.set_xlim(0, 1.02 * max(max(line.get_xdata()) for line in axes.lines))
         axes.set_ylim(-0.05, 1.05)
         axes.set_xlabel("million frames")
         axes.xaxis.set_major_formatter(lambda frames, _: f"{frames / 1e6:g}")
