@@ -123,7 +123,7 @@ def open_stage(options: Options, name: str, of: Any = None) -> Stage:
         stage.result = None
     torch.set_num_threads(options.threads)
     if options.progress:
-        tell_progress(name)
+        tell_progress(name if stage.result is None else None)
     print(f"{name}: {'running' if stage.result is None else 'done before'}", flush=True)
     return stage
 
@@ -216,6 +216,7 @@ def fit_options(options: Options, stage: Stage) -> dict[str, Any]:
 
 def finish(options: Options, stage: Stage, result: dict[str, Any], history: Any = None) -> dict:
     """Record that a stage is done, and on which machine."""
+    tell_progress(None)
     return stage.finish(result, history, machine=machine_of(options.device))
 
 

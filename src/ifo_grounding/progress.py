@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,11 +20,16 @@ _told: list[str] = []
 """What this process works on, where it tells how far it is."""
 
 
-def tell_progress(stage: str) -> None:
-    """Tell from now on how far a stage is."""
-    began, _told[:] = bool(_told), [stage]
-    if not began and not sys.stderr.isatty():
-        threading.Thread(target=_tell, args=(time.monotonic(),), daemon=True).start()
+def tell_progress(stage: str | None) -> None:
+    """Tell from now on how far a stage is, or nothing."""
+    _told[:] = [stage] if stage else []
+    if stage and not sys.stderr.isatty():
+        _begin()
+
+
+@cache
+def _begin() -> None:
+    threading.Thread(target=_tell, args=(time.monotonic(),), daemon=True).start()
 
 
 def progress_bar(*args: Any, shown: bool | None = None, **options: Any) -> Any:
@@ -38,6 +44,8 @@ def _tell(begun: float) -> None:
     """Write lines with the stage and the bars that are at work."""
     while True:
         time.sleep(EVERY)
+        if not _told:
+            continue
         bars = sorted(getattr(tqdm, "_instances", ()), key=lambda one: one.start_t)
         parts = [tqdm.format_meter(**{**one.format_dict, "bar_format": LINE}) for one in bars]
         now = f"{''.join(_told)}: running ({time.monotonic() - begun:,.0f} s since the start)"
