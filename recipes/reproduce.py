@@ -99,12 +99,10 @@ class ReproduceOptions:
         for kind in ("table", "figure"):
             if (number := getattr(self, kind)) is not None:
                 check_choice(kind, number, [of for which, of in WANTED if which == kind])
-        for task in self.tasks:
-            check_choice("task", task, TASKS)
-        for preset in self.presets:
-            check_choice("preset", preset, ("strong", "paper"))
-        for method in self.methods:
-            check_choice("method", method, METHODS)
+        presets = ("strong", "paper")
+        for kind, of in (("task", TASKS), ("preset", presets), ("method", METHODS)):
+            for name in getattr(self, f"{kind}s"):
+                check_choice(kind, name, of)
         if self.jobs < 1:
             raise UserError(f"jobs must be at least 1, got {self.jobs}")
 

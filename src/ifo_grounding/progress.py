@@ -44,9 +44,8 @@ def _tell(begun: float) -> None:
     """Write lines with the stage and the bars that are at work."""
     while True:
         time.sleep(EVERY)
-        if not _told:
-            continue
-        bars = sorted(getattr(tqdm, "_instances", ()), key=lambda one: one.start_t)
-        parts = [tqdm.format_meter(**{**one.format_dict, "bar_format": LINE}) for one in bars]
-        now = f"{''.join(_told)}: running ({time.monotonic() - begun:,.0f} s since the start)"
-        print("; ".join([now, *parts]), file=sys.stderr, flush=True)
+        for stage in tuple(_told):
+            bars = sorted(getattr(tqdm, "_instances", ()), key=lambda one: one.start_t)
+            parts = [tqdm.format_meter(**{**one.format_dict, "bar_format": LINE}) for one in bars]
+            now = f"{stage}: running ({time.monotonic() - begun:,.0f} s since the start)"
+            print("; ".join([now, *parts]), file=sys.stderr, flush=True)
