@@ -26,6 +26,7 @@ from pages import (
     write,
 )
 
+from ifo_grounding.baselines.config import UNLEARNED
 from ifo_grounding.report import figure_png, markdown_table, rates_by_number, training_curves
 from ifo_grounding.report.results import brief
 from ifo_grounding.report.theme import PALETTE, add_legend
@@ -184,7 +185,8 @@ def baseline_rows(few: bool) -> list[Row]:
 
 def more_seeds(*methods: Runs) -> str:
     """Return how many seeds ran, where all methods have as many and more than one."""
-    (most, *others) = {len(runs) for runs in methods}
+    learned = [runs for runs in methods if runs[0]["options"]["method"] not in UNLEARNED]
+    (most, *others) = {len(runs) for runs in learned or methods}
     return f", {most} seeds" if most > 1 and not others else ""
 
 

@@ -50,6 +50,9 @@ def read(folder: str, key: Callable[[dict[str, Any]], Any]) -> dict[Any, Runs]:
     found: dict[Any, Runs] = {}
     for path in sorted((RESULTS / folder).glob("*.json")):
         run = read_json(path)
+        stream = run["options"].get("evaluate", {}).get("stream", "evaluation")
+        if stream != ("validation" if folder == "tuning" else "evaluation"):
+            raise ValueError(f"{path} is of {stream} scenes")
         found.setdefault(key(run["options"]), []).append(run)
     return found
 

@@ -64,8 +64,8 @@ from ifo_grounding.training import Run, Stage, fit, improve_policy
 ENTROPY = 0.01
 """Weight of the entropy bonus of a policy that learns from a discriminator."""
 WINDOW = 64
-"""Steps of each world per iteration where every step is paid. In windows hardly longer than
-episodes, even a perfect policy would stop less often than demonstrations do."""
+"""Steps of each world per iteration, each of which begins new episodes. In windows hardly longer
+than these, even a perfect policy would stop less often than demonstrations do."""
 ROWS = 32
 """Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {
@@ -236,7 +236,7 @@ def adversarial(options: Options, stage: Stage) -> None:
     value = build(make_value, options, init_from=policy)
     practice = practice_of(options)
     worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
-    seen, more = access(options, run), options.networks.changed()
+    seen, more = access(options, run, worlds), options.networks.changed()
     if method == "gaifo":
         more["inverse"] = load_network(run, INVERSE, options)
     adversary = ADVERSARIES[method](
@@ -287,16 +287,14 @@ def adversarial(options: Options, stage: Stage) -> None:
 def practice_of(options: Options) -> Any:
     """Return the settings of phase 2, with as many frames per iteration in longer windows."""
     practice = options.self_examine
-    worlds, steps = practice.num_envs, practice.steps
-    if options.method not in ("agile", "agile-chosen"):  # which are paid at the stop alone
-        worlds, steps = math.ceil(worlds * steps / WINDOW), WINDOW
+    worlds, steps = math.ceil(practice.num_envs * practice.steps / WINDOW), WINDOW
     if practice.gamma == 0:  # preset=paper: for a reward that says of each action what it is worth
         practice = type(practice)()
     return replace(practice, num_envs=worlds, steps=steps)
 
 
-def access(options: Options, run: Run) -> Any:
-    """Return what a method may use of the demonstrations."""
+def access(options: Options, run: Run, worlds: int) -> Any:
+    """Return what a method may use of the demonstrations, steps in so many worlds at once."""
     demos, world = load_demonstrations(run), world_of(options)
     kind = ADVERSARIES[options.method].access
     if kind is ActionDemonstrations:
@@ -304,7 +302,6 @@ def access(options: Options, run: Run) -> Any:
             raise UserError(f"{options.method} needs true actions, and these were not recorded")
         return ActionDemonstrations(demos, Truth.load(run / TRUTH))
     if kind is SteppableDemonstrations:
-        worlds = options.self_examine.num_envs
         env = world.steppable(worlds, seed=options.seed, device=options.device)
         return SteppableDemonstrations(demos, env)
     return demos

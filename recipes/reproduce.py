@@ -16,7 +16,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from tqdm import tqdm
 
-from ifo_grounding.baselines.config import METHODS, PLANNED
+from ifo_grounding.baselines.config import METHODS, PLANNED, UNLEARNED
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.cluster import Call, run_on_cluster
 from ifo_grounding.errors import UserError, check_choice
@@ -179,34 +179,35 @@ def of_methods(
 ) -> Iterator[Piece]:
     """Yield a piece for each method of Table 1, of one run, or for each trial, of a run each.
 
-    Trials of what comes behind phase 1 begin with the phase 1 of the first of them.
+    Trials begin with the phase 1 of the first one that chose values of the same options, unless
+    these are of phase 1.
     """
-    name = f"{task}-{n}-{preset}"
+    more = "" if options.frames == ReproduceOptions.frames else f"{options.frames / 1e6:g}M"
+    name = "-".join(filter(None, (task, str(n), preset, more)))
     of_run = {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n, **options.method}
     of_run |= {"baseline.frames": options.frames, "world": options.preset[preset].get("world", {})}
-    if options.frames != ReproduceOptions.frames and not options.tune:
-        of_run["variant"] = f"{options.frames / 1e6:g}M"
-        name += f"-{of_run['variant']}"
-    base = None
+    begun: dict[tuple[str, ...], str] = {}
     for method in options.tuning if options.tune else METHODS:
         if method not in options.methods or (method == "lc-rl" and task not in PLANNED):
             continue
         if not options.tune:
+            if method in UNLEARNED and seed != options.seeds[0]:
+                continue  # the same in the same scenes
             run, file = f"baselines-{name}-seed{seed}", f"baselines/{name}-{method}-seed{seed}.json"
-            yield piece(options, run, file, of_run, {"method": method}, recipe="baselines")
+            of_method = {"method": method} | ({"variant": more} if more else {})
+            yield piece(options, run, file, of_run, of_method, recipe="baselines")
             continue
         space = options.tuning[method]
-        behind = all(option.startswith(BEHIND_PHASE_1) for option in space)
         for number, values in enumerate(product(*space.values())):
             run = f"tuning-{name}-{method}-{number}-seed{seed}"
             file = f"tuning/{name}-trial{number}-{method}-seed{seed}.json"
-            trial = {"method": method, "variant": f"trial{number}"}
-            trial |= zip(space, values, strict=True)
+            variant = "-".join(filter(None, (more, f"trial{number}")))
+            trial = {"method": method, "variant": variant, **dict(zip(space, values, strict=True))}
+            base = begun.get(tuple(space))
             chosen = (of_run, options.tuned, trial)
-            begun = base if behind else None
-            yield piece(options, run, file, *chosen, base=begun, recipe="baselines")
-            if behind:
-                base = base or run
+            yield piece(options, run, file, *chosen, base=base, recipe="baselines")
+            if all(option.startswith(BEHIND_PHASE_1) for option in space):
+                begun.setdefault(tuple(space), run)
 
 
 def of_level(options: ReproduceOptions, seed: int, n: int, level: str) -> Piece:

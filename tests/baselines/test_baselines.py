@@ -190,20 +190,19 @@ def test_every_step_is_paid_its_logit_and_an_end_what_the_absorbing_state_pays()
     reward = DiscriminatorReward(model, state)
     assert reward.pay(before, after).tolist() == [[2.0], [-1.0], [2.0]]  # nothing is counted yet
     done = torch.tensor([[False, True, False, False], [False, False, False, True]]).unsqueeze(-1)
-    state.count(TensorDict({"next": {"done": done}}, [2, 4]))  # four steps an episode
-    step = math.log((1 - 1 / 8) / (1 - 1 / 16))
-    end = sum(0.5**later * math.log((1 / 8) / (1 / 16)) for later in range(60))
+    state.count(TensorDict({"next": {"done": done}}, [2, 4]))
+    own = 1 + 1 + 2 / 3 + 2 / 3  # two of three that reach the second step go on, one to the fourth
+    step = math.log((1 - 1 / 8) / (1 - 0.5**own))
+    end = sum(0.5**later * math.log((1 / 8) / 0.5**own) for later in range(1, 60))
     expected = [[2 + step + end], [-1 + step + end], [2 + step]]
     torch.testing.assert_close(reward.pay(before, after), torch.tensor(expected))
 
 
-@pytest.mark.parametrize("length", [2, 5, 9])
+@pytest.mark.parametrize("length", [2, 5, 9, 40])
 def test_episodes_as_long_as_demonstrations_are_paid_logits_alone(length):
-    done = torch.arange(1, 91).remainder(length).eq(0).view(1, -1, 1)
+    done = torch.arange(1, 65).remainder(length).eq(0).view(1, -1, 1)  # the last one is cut off
     state = AbsorbingState(float(length), gamma=0.95)
-    state.count(
-        TensorDict({"next": {"done": done[:, : 90 // length * length]}}, [1, 90 // length * length])
-    )
+    state.count(TensorDict({"next": {"done": done}}, [1, 64]))
     torch.testing.assert_close(torch.stack([state.step, state.end]), torch.zeros(2))
 
 
@@ -265,7 +264,7 @@ def test_updates_tell_demonstrations_from_the_policy(name, sources):
 def test_episodes_that_do_not_end_are_as_long_as_what_is_collected():
     state = AbsorbingState(3.0, gamma=0.5)
     state.count(TensorDict({"next": {"done": torch.zeros(2, 5, 1, dtype=torch.bool)}}, [2, 5]))
-    assert float(state.end) == pytest.approx((5 - 3) * math.log(2) / 0.5, rel=1e-5)
+    assert float(state.end) == pytest.approx((5 - 3) * math.log(2), rel=1e-5)
     for gamma in (0.0, 1.0):
         with pytest.raises(UserError, match="gamma must be above 0 and below 1"):
             AbsorbingState(3.0, gamma)
@@ -274,6 +273,17 @@ def test_episodes_that_do_not_end_are_as_long_as_what_is_collected():
 def test_fewer_demonstrations_count_less_than_the_prior(sources):
     adversary = GAIfO(sources["frames"], prior=600.0, **SMALL)
     assert [group["weight_decay"] for group in adversary.optimizer.param_groups] == [50.0]
+
+
+def test_an_inverse_model_decays_towards_what_it_was(sources):
+    inverse = networks.make_inverse(sources["frames"], **SMALL)
+    begun = [weight.detach().clone() for weight in inverse.parameters()]
+    how = {"prior": 600.0, "lr": 1e-3, "steps": 60, **SMALL}
+    adversary = GAIfO(sources["frames"], inverse=inverse, **how)
+    adversary(sources["steps"].starts(seed=2).rollout(12, break_when_any_done=False))
+    moved = [now - then for now, then in zip(inverse.parameters(), begun, strict=True)]
+    norms = [torch.cat([weight.flatten() for weight in of]).norm() for of in (moved, begun)]
+    assert 0 < norms[0] < norms[1] / 2  # of themselves they would have lost 95%
 
 
 def test_a_method_has_a_learning_rate_of_its_own(sources):

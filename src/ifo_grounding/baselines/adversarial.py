@@ -34,9 +34,11 @@ from ifo_grounding.networks import (
     make_reward_model,
 )
 from ifo_grounding.networks.trunk import RewardNetwork
+from ifo_grounding.networks.warm_start import remember
 from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.training import AdversarialUpdates
 from ifo_grounding.training.loop import Metrics
+from ifo_grounding.training.updates import decay_towards_origin
 from ifo_grounding.transforms.reward import RewardTransform
 
 
@@ -163,6 +165,7 @@ class Adversary(AdversarialUpdates):
         decay = prior / len(demos)
         rate = self.lr if lr is None else lr
         super().__init__(loss, self.demonstrated(seen), steps, rate, batch_size, decay)
+        decay_towards_origin(self.optimizer, self.network)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Count the policy's steps [N, T], train on them, and return mean metrics."""
@@ -231,7 +234,8 @@ class ChangeNetwork(nn.Module):
 class GAIfO(Adversary):
     """Tells demonstrated changes from the policy's: state, next state, instruction.
 
-    With ``inverse=`` the discriminator begins with an inverse model, which learns on with it.
+    With ``inverse=`` the discriminator begins with an inverse model, which learns on with it, and
+    whose weights decay towards what they were.
     """
 
     access: type[Any] = Demonstrations
@@ -241,7 +245,10 @@ class GAIfO(Adversary):
         return transitions_of(seen)
 
     def discriminator(self, shapes: Any, preset: str, **options: Any) -> TensorDictModule:  # noqa: D102
-        inverse = options.pop("inverse", None) or make_inverse(shapes, preset, **options)
+        if inverse := options.pop("inverse", None):
+            remember(inverse.module)
+        else:
+            inverse = make_inverse(shapes, preset, **options)
         reward = make_reward_model(shapes, preset, **options)
         network = ChangeNetwork(inverse.module, reward.module, self.stop_action)
         in_keys = [keys.PIXELS, keys.NEXT_PIXELS, ENDED, keys.INSTRUCTION]

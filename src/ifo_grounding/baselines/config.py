@@ -21,6 +21,8 @@ METHODS = {
     "expert": "record_demonstrations",
 }
 """Methods of Table 1 and references, and the last stage of a run that each begins with."""
+UNLEARNED = ("random", "expert")
+"""Those that learn nothing, so that every seed does the same in the same scenes."""
 PLANNED = ("move", "move-udlr")
 """The tasks of ``lc-rl``, whose plans are of the arm's cells."""
 

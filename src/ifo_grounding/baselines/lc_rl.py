@@ -8,6 +8,7 @@ which it is measured.
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -128,10 +129,14 @@ class LCRL:
         if not torch.isin(actions, torch.tensor(CHOICES)).all():
             raise UserError("LC-RL plans moves and a stop, and a demonstrator here did more")
         self.choice = actions.where(actions != keys.STOP, len(CHOICES) - 1)
-        self.cells = self._cells()
 
-    def _cells(self) -> Tensor:
-        """Find where the arm is in each transition, by the frame alone: int64 [transitions]."""
+    @cached_property
+    def cells(self) -> Tensor:
+        """Where the arm is in each transition, found by the frame alone: int64 [transitions].
+
+        Raises:
+            UserError: where a demonstration changes its scene.
+        """
         demos, found = self.seen.demos, []
         episode, frame = demos.locate()
         for index in torch.arange(len(demos)).split(self.seen.steps.env.batch_size.numel()):
@@ -158,8 +163,8 @@ class LCRL:
 
     def learn(self, steps: int, batch_size: int = 32, seed: int = 0) -> Metrics:
         """Raise the likelihood of demonstrated choices; return mean metrics."""
+        demos, cells, updates = self.seen.demos, self.cells, []
         torch.manual_seed(seed)
-        demos, updates = self.seen.demos, []
         episode, _ = demos.locate()
         self.network.train()
         for _ in range(steps):
@@ -168,7 +173,7 @@ class LCRL:
             chosen = soft_values(self.rewards(frames, instruction), self.moves, self.horizon)
             of_these = torch.isin(episode, index)
             row = torch.searchsorted(index, episode[of_these])
-            told = chosen[row, self.cells[of_these], self.choice[of_these]]
+            told = chosen[row, cells[of_these], self.choice[of_these]]
             losses = TensorDict({"loss_likelihood": -told.mean()})
             updates.append(update(losses, self.optimizer, grad_clip=1.0))
         self.network.eval()

@@ -56,11 +56,23 @@ class AbsorbingState(nn.Module):
         self.register_buffer("end", torch.zeros(()))
 
     def count(self, batch: TensorDictBase) -> None:
-        """Measure the policy's episodes in collected steps [N, T]; longer ones count T."""
-        own = batch.numel() / max(len(batch), int(batch[keys.NEXT, "done"].sum()))
+        """Measure the policy's episodes in collected steps [N, T]; longer ones count T.
+
+        An episode that the last step cuts off tells only that it is no shorter (Kaplan and Meier
+        1958): to count it as ended would make long ones longer.
+        """
+        done = batch[keys.NEXT, "done"].squeeze(-1)
+        now = torch.arange(done.shape[1], device=done.device).expand_as(done)
+        begun = torch.where(done, now + 1, 0).cummax(1).values.roll(1, 1)
+        begun[:, 0] = 0
+        age = now - begun
+        reached, ended = (age[of].bincount(minlength=len(now[0])) for of in (age >= 0, done))
+        going_on = (1 - ended / reached.clamp(min=1)).cumprod(0)
+        own = 1 + float(going_on[:-1].sum())
         among_steps = (1 - self.gamma**self.length) / (1 - self.gamma**own)
         self.step.fill_(math.log(among_steps))
-        self.end.fill_((self.length - own) * math.log(self.gamma) / (1 - self.gamma))
+        worth = self.gamma / (1 - self.gamma)  # it begins with the step after the last
+        self.end.fill_((self.length - own) * math.log(self.gamma) * worth)
 
 
 class _Judged(RewardTransform):

@@ -59,9 +59,14 @@ def started(module: Any, policy: nn.Module | None, roles: bool = False) -> Any:
             f"{network.config} for {network.shapes}; give both the same preset, sizes and options"
         ) from None
     for _, taken in [*parts, *widened]:
-        copied = {name: weight.detach().clone() for name, weight in taken.named_parameters()}
-        taken.inherited = copied  # type: ignore[assignment]
+        remember(taken)
     return module
+
+
+def remember(module: nn.Module) -> None:
+    """Let :func:`inherited` return the weights of a module as they are now."""
+    copied = {name: weight.detach().clone() for name, weight in module.named_parameters()}
+    module.inherited = copied  # type: ignore[assignment]
 
 
 def inherited(module: nn.Module) -> list[tuple[nn.Parameter, Tensor]]:
