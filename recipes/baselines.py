@@ -287,7 +287,9 @@ def adversarial(options: Options, stage: Stage) -> None:
 def practice_of(options: Options) -> Any:
     """Return the settings of phase 2, with as many frames per iteration in longer windows."""
     practice = options.self_examine
-    worlds, steps = math.ceil(practice.num_envs * practice.steps / WINDOW), WINDOW
+    worlds, steps = practice.num_envs, practice.steps
+    if options.method not in ("agile", "agile-chosen"):  # which learn more in shorter ones
+        worlds, steps = math.ceil(worlds * steps / WINDOW), WINDOW
     if practice.gamma == 0:  # preset=paper: for a reward that says of each action what it is worth
         practice = type(practice)()
     return replace(practice, num_envs=worlds, steps=steps)

@@ -79,7 +79,7 @@ def test_where_phase_2_has_no_discount_a_rival_learns_by_the_defaults(options, t
     given = options(*FEWER, "preset=paper", "method=agile", run="paper")
     assert given.self_examine.gamma == 0
     practice = practice_of(given)
-    assert (practice.algorithm, practice.gamma, practice.steps) == ("ppo", 0.99, 64)
+    assert (practice.algorithm, practice.gamma, practice.steps) == ("ppo", 0.99, 10)
     assert 0 <= baseline(given)["agile"]["rate"]["rate"] <= 1
 
 
