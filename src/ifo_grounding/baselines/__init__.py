@@ -1,4 +1,4 @@
-"""Rivals of the paper's Table 1, each with exactly the access it is allowed.
+"""Rivals as in the paper's Table 1, each with exactly the access it is allowed.
 
 Nothing of the method itself imports this package: a learner of observation-only demonstrations
 neither reads their actions nor steps from their states.

@@ -1,4 +1,4 @@
-"""What a method may use of demonstrations: a type for each row of the paper's Table 1."""
+"""What a method may use of demonstrations: a type for each access of the paper's Table 1."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ class GAIL(Adversary):
     """Tells demonstrated actions from the policy's: state, instruction, action."""
 
     access: type[Any] = ActionDemonstrations
-    lr = 3e-3
+    lr = 1e-3
 
     def demonstrated(self, seen: ActionDemonstrations) -> TensorDictReplayBuffer:  # noqa: D102
         return seen.transitions()
