@@ -56,17 +56,19 @@ class AbsorbingState(nn.Module):
         self.register_buffer("end", torch.zeros(()))
 
     def count(self, batch: TensorDictBase) -> None:
-        """Measure the policy's episodes in collected steps [N, T]; longer ones count T.
+        """Measure the policy's episodes in collected steps [N, T]; where none ends, they count T.
 
         An episode that the last step cuts off tells only that it is no shorter (Kaplan and Meier
-        1958): to count it as ended would make long ones longer.
+        1958).
         """
         done = batch[keys.NEXT, "done"].squeeze(-1)
         now = torch.arange(done.shape[1], device=done.device).expand_as(done)
         begun = torch.where(done, now + 1, 0).cummax(1).values.roll(1, 1)
         begun[:, 0] = 0
         age = now - begun
-        reached, ended = (age[of].bincount(minlength=len(now[0])) for of in (age >= 0, done))
+        reached, ended = (
+            ages.flatten().bincount(minlength=done.shape[1]) for ages in (age, age[done])
+        )
         going_on = (1 - ended / reached.clamp(min=1)).cumprod(0)
         own = 1 + float(going_on[:-1].sum())
         among_steps = (1 - self.gamma**self.length) / (1 - self.gamma**own)
