@@ -290,7 +290,7 @@ def test_a_method_has_a_learning_rate_of_its_own(sources):
     def rate_of(**given):
         return GAIfO(sources["frames"], **SMALL, **given).optimizer.param_groups[0]["lr"]
 
-    assert (rate_of(), rate_of(lr=0.5)) == (1e-4, 0.5)
+    assert (rate_of(), rate_of(lr=0.5)) == (3e-4, 0.5)
 
 
 def test_agile_needs_a_stop(sources):

@@ -239,7 +239,7 @@ class GAIfO(Adversary):
     """
 
     access: type[Any] = Demonstrations
-    lr = 1e-4
+    lr = 3e-4
 
     def demonstrated(self, seen: Demonstrations) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(seen)
