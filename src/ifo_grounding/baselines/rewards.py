@@ -37,7 +37,7 @@ class AbsorbingState(nn.Module):
     >>> done = torch.tensor([[0, 1, 0, 1]]).bool().unsqueeze(-1)  # two episodes of two steps
     >>> state.count(TensorDict({"next": {"done": done}}, [1, 4]))
     >>> [round(float(paid), 2) for paid in (state.step, state.end)]  # longer ones are wanted
-    [0.77, -3.16]
+    [0.77, -2.84]
     """
 
     step: Tensor
