@@ -64,8 +64,8 @@ from ifo_grounding.training import Run, Stage, fit, improve_policy
 ENTROPY = 0.01
 """Weight of the entropy bonus of a policy that learns from a discriminator."""
 WINDOW = 64
-"""Steps of each world per iteration, each of which begins new episodes. In windows hardly longer
-than these, even a perfect policy would stop less often than demonstrations do."""
+"""Steps of each world per iteration where every step is paid. In windows hardly longer than
+episodes, even a perfect policy would stop less often than demonstrations do."""
 ROWS = 32
 """Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {

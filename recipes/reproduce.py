@@ -194,7 +194,7 @@ def of_methods(
             if method in UNLEARNED and seed != options.seeds[0]:
                 continue  # the same in the same scenes
             run, file = f"baselines-{name}-seed{seed}", f"baselines/{name}-{method}-seed{seed}.json"
-            of_method = {"method": method} | ({"variant": more} if more else {})
+            of_method = {"method": method, "variant": more or None}
             yield piece(options, run, file, of_run, of_method, recipe="baselines")
             continue
         space = options.tuning[method]

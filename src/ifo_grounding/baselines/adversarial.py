@@ -38,7 +38,6 @@ from ifo_grounding.networks.warm_start import remember
 from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.training import AdversarialUpdates
 from ifo_grounding.training.loop import Metrics
-from ifo_grounding.training.updates import decay_towards_origin
 from ifo_grounding.transforms.reward import RewardTransform
 
 
@@ -165,7 +164,6 @@ class Adversary(AdversarialUpdates):
         decay = prior / len(demos)
         rate = self.lr if lr is None else lr
         super().__init__(loss, self.demonstrated(seen), steps, rate, batch_size, decay)
-        decay_towards_origin(self.optimizer, self.network)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Count the policy's steps [N, T], train on them, and return mean metrics."""

@@ -14,7 +14,7 @@ from ifo_grounding.errors import check_range
 from ifo_grounding.modules import beside
 from ifo_grounding.objectives import ImitationLoss, SupervisedLoss
 from ifo_grounding.training.loop import Metrics
-from ifo_grounding.training.updates import make_optimizer, means, update
+from ifo_grounding.training.updates import decay_towards_origin, make_optimizer, means, update
 
 
 @dataclass
@@ -57,7 +57,7 @@ class AdversarialUpdates:
             :class:`~ifo_grounding.objectives.RewardLoss`.
         steps: gradient steps after each iteration of self-examination.
         batch_size: demonstrated steps, and as many of the policy's, in each gradient step.
-        weight_decay: decoupled, of the reward model.
+        weight_decay: decoupled; inherited weights decay towards what they were.
     """
 
     loss: Any
@@ -74,6 +74,8 @@ class AdversarialUpdates:
         self.loss, self.demonstrations = loss, demonstrations
         self.steps, self.batch_size = steps, batch_size
         self.optimizer = make_optimizer(loss.parameters(), lr, weight_decay)
+        if weight_decay:
+            decay_towards_origin(self.optimizer, loss)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
         """Train on the policy's steps [N, T] and return mean metrics, named ``reward/...``."""
