@@ -198,10 +198,10 @@ def own_seeds(methods: dict[str, Runs], method: str) -> str:
 def trial_rows() -> list[Row]:
     """Return how often each trial of a method of Table 1 succeeds on validation scenes."""
     space = OmegaConf.load(ROOT / "recipes/conf/reproduce.yaml").tuning
-    found = read("tuning", lambda options: (options["method"], options["variant"]))
-    rows = []
-    for method in USES:
-        trials = [runs for (of, _), runs in found.items() if of == method]
+    found = read("tuning", lambda o: (o["method"], o["demonstrations"]["n"], o["variant"]))
+    rows: dict[str, Row] = {}
+    for method, number in product(USES, sorted({number for _, number, _ in found})):
+        trials = [runs for key, runs in found.items() if key[:2] == (method, number)]
         if not trials:
             continue
         ((option, values),) = space[method].items()
@@ -210,9 +210,9 @@ def trial_rows() -> list[Row]:
         best = max(shares.values())
         shown = {value: f"{value:g}: {percent([shares[value]])}" for value in values}
         texts = (f"**{text}**" if shares[value] == best else text for value, text in shown.items())
-        row = {"method": f"`{method}`", "option": f"`{option}`", "trials": ", ".join(texts)}
-        rows.append(row)
-    return rows
+        row = rows.setdefault(method, {"method": f"`{method}`", "option": f"`{option}`"})
+        row[f"{number:,}{more_seeds(*trials)}"] = ", ".join(texts)
+    return list(rows.values())
 
 
 def ahead_rows() -> list[Row]:

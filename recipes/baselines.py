@@ -63,9 +63,8 @@ from ifo_grounding.training import Run, Stage, fit, improve_policy
 
 ENTROPY = 0.01
 """Weight of the entropy bonus of a policy that learns from a discriminator."""
-WINDOW = 64
-"""Steps of each world per iteration where every step is paid. In windows hardly longer than
-episodes, even a perfect policy would stop less often than demonstrations do."""
+UNSEEN = 200
+"""Demonstrations of validation scenes that a discriminator is asked about in the end."""
 ROWS = 32
 """Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {
@@ -90,6 +89,9 @@ def baseline(options: Options) -> dict[str, Any]:
     results = measured(learned, options)
     if curve := learning_curve(stage.run, options.method):
         results["curve"] = curve
+    trained_by = stage.run.stage(f"baseline_{options.method}").result or {}
+    if said := trained_by.get("discriminator"):
+        results["discriminator"] = said
     finish(options, stage, {"of": asked, "results": results})
     return results
 
@@ -234,7 +236,7 @@ def adversarial(options: Options, stage: Stage) -> None:
     begun = method == "gail+bc"
     policy = load_network(run, REFERENCE, options) if begun else new_policy(options, options.seed)
     value = build(make_value, options, init_from=policy)
-    practice = practice_of(options)
+    practice = ADVERSARIES[method].practice(options.self_examine)
     worlds, rounds = practice.num_envs, practice.num_envs * practice.steps
     seen, more = access(options, run, worlds), options.networks.changed()
     if method == "gaifo":
@@ -281,18 +283,14 @@ def adversarial(options: Options, stage: Stage) -> None:
         cudagraph=True,
     )
     save_network(run, file_of(method), policy)
-    finish(options, stage, {"of": plain(section), **history[-1]}, history)
-
-
-def practice_of(options: Options) -> Any:
-    """Return the settings of phase 2, with as many frames per iteration in longer windows."""
-    practice = options.self_examine
-    worlds, steps = practice.num_envs, practice.steps
-    if options.method not in ("agile", "agile-chosen"):  # which learn more in shorter ones
-        worlds, steps = math.ceil(worlds * steps / WINDOW), WINDOW
-    if practice.gamma == 0:  # preset=paper: for a reward that says of each action what it is worth
-        practice = type(practice)()
-    return replace(practice, num_envs=worlds, steps=steps)
+    said = {of: history[-1][f"reward/{of}_probability"] for of in ("demonstrated", "policy")}
+    if not options.recorded:
+        unseen, truth = world.demonstrate(UNSEEN, seed=options.seed, stream="validation")
+        acted = adversary.access is ActionDemonstrations
+        shown = ActionDemonstrations(unseen, truth) if acted else unseen
+        said["unseen"] = adversary.probability(shown)
+    found = {"of": plain(section), **history[-1], "discriminator": said}
+    finish(options, stage, found, history)
 
 
 def access(options: Options, run: Run, worlds: int) -> Any:

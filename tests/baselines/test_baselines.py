@@ -23,6 +23,7 @@ from ifo_grounding.baselines import (
     StopReward,
     steps_of_policy,
 )
+from ifo_grounding.config import SelfExamineConfig
 from ifo_grounding.data import record_demonstrations
 from ifo_grounding.envs import PickAndPlaceEnv
 from ifo_grounding.errors import UserError
@@ -259,6 +260,7 @@ def test_updates_tell_demonstrations_from_the_policy(name, sources):
     later = adversary(batch)
     gap = later["reward/demonstrated_probability"] - later["reward/policy_probability"]
     assert gap > 0.5 and later["reward/loss_discriminator"] < metrics["reward/loss_discriminator"]
+    assert adversary.probability(sources[name]) > 0.7 > later["reward/policy_probability"]
 
 
 def test_episodes_that_do_not_end_are_as_long_as_what_is_collected():
@@ -284,6 +286,13 @@ def test_an_inverse_model_decays_towards_what_it_was(sources):
     moved = [now - then for now, then in zip(inverse.parameters(), begun, strict=True)]
     norms = [torch.cat([weight.flatten() for weight in of]).norm() for of in (moved, begun)]
     assert 0 < norms[0] < norms[1] / 2  # of themselves they would have lost 95%
+
+
+def test_windows_hold_as_many_frames_as_those_of_phase_2():
+    phase2 = SelfExamineConfig(num_envs=20, steps=16, lr=0.5)
+    practice = GAIL.practice(phase2)
+    assert (practice.num_envs, practice.steps, practice.lr) == (5, 64, 0.5)
+    assert AGILE.practice(phase2) == phase2
 
 
 def test_a_method_has_a_learning_rate_of_its_own(sources):

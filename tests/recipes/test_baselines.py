@@ -5,6 +5,7 @@ import shutil
 import pytest
 
 from ifo_grounding import networks
+from ifo_grounding.baselines import AGILE
 from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.config import STAGES
 from ifo_grounding.errors import UserError
@@ -51,6 +52,9 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
             rows = read_json(run / f"metrics/baseline_{method}.json")
             frames = sum(row["frames"] for row in rows)
             assert frames >= 160 and results["curve"][-1][0] == frames
+            said = results["discriminator"]
+            assert said.keys() == {"demonstrated", "policy", "unseen"}
+            assert all(0 < probability < 1 for probability in said.values())
         with pytest.raises(UserError, match="give another run="):
             baseline(options(*FEWER, f"method={method}", "baseline.frames=240"))
     stamp = trained.stat().st_mtime_ns if trained.exists() else None
@@ -74,11 +78,11 @@ def test_a_rival_has_the_policy_of_the_run(options, tmp_path):
 
 
 def test_where_phase_2_has_no_discount_a_rival_learns_by_the_defaults(options, tmp_path):
-    from baselines import baseline, practice_of
+    from baselines import baseline
 
     given = options(*FEWER, "preset=paper", "method=agile", run="paper")
     assert given.self_examine.gamma == 0
-    practice = practice_of(given)
+    practice = AGILE.practice(given.self_examine)
     assert (practice.algorithm, practice.gamma, practice.steps) == ("ppo", 0.99, 10)
     assert 0 <= baseline(given)["agile"]["rate"]["rate"] <= 1
 

@@ -8,6 +8,8 @@ instruction, and pays through one transform, so that
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -136,6 +138,9 @@ class Adversary(AdversarialUpdates):
     """Share of the policy's steps that is left out."""
     lr: float
     """Learning rate of the discriminator by default, the best of three on validation scenes."""
+    window: int | None = 64
+    """Steps of each world per iteration, where every step is paid: in windows hardly longer than
+    episodes, even a perfect policy would stop less often than demonstrations do."""
     network: TensorDictModule
     reward: RewardTransform
 
@@ -170,6 +175,22 @@ class Adversary(AdversarialUpdates):
         if self.loss.absorbing is not None:
             self.loss.absorbing.count(batch)
         return super().__call__(batch)
+
+    @classmethod
+    def practice(cls, phase2: Any) -> Any:
+        """Return settings of phase 2, with as many frames per iteration in windows of its own."""
+        worlds, steps = phase2.num_envs, phase2.steps
+        if cls.window is not None:
+            worlds, steps = math.ceil(worlds * steps / cls.window), cls.window
+        if phase2.gamma == 0:  # preset=paper: for a reward that says what each action is worth
+            phase2 = type(phase2)()
+        return replace(phase2, num_envs=worlds, steps=steps)
+
+    def probability(self, seen: Any) -> float:
+        """Return the mean probability that demonstrations, of the same access, are demonstrated."""
+        with torch.no_grad():
+            logits = self.loss._logits(self.demonstrated(seen)[:])
+        return float(logits.sigmoid().mean())
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:
         """Return the demonstrated steps that are told apart from the policy's."""
@@ -263,6 +284,7 @@ class AGILE(Adversary):
     access: type[Any] = SteppableDemonstrations
     spare = 0.75
     lr = 1e-3
+    window = None  # learns more in short ones
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(frames_of(seen), last=True)
