@@ -195,6 +195,21 @@ def own_seeds(methods: dict[str, Runs], method: str) -> str:
     return "" if more_seeds(*methods.values()) else more_seeds(methods[method])
 
 
+def discriminator_rows() -> list[Row]:
+    """Return what discriminators say in the end: of demonstrations, unseen ones, the policy's."""
+    rows: dict[str, Row] = {}
+    for key, methods in by_method().items():
+        for method, runs in methods.items():
+            said = [r["results"]["discriminator"] for r in runs if "discriminator" in r["results"]]
+            if said and "agile" not in method:  # which spares what of the policy's it likes best
+                means = [
+                    fmean(of[who] for of in said) for who in ("demonstrated", "unseen", "policy")
+                ]
+                row = rows.setdefault(method, {"method": f"`{method}`"})
+                row[title_of(*key)] = ", ".join(f"{100 * mean:.0f}%" for mean in means)
+    return list(rows.values())
+
+
 def trial_rows() -> list[Row]:
     """Return how often each trial of a method of Table 1 succeeds on validation scenes."""
     space = OmegaConf.load(ROOT / "recipes/conf/reproduce.yaml").tuning
@@ -323,6 +338,7 @@ def tables() -> dict[str, str]:
         "baselines": baseline_rows(few=True),
         "baselines-more": baseline_rows(few=False),
         "ours-ahead": ahead_rows(),
+        "discriminators": discriminator_rows(),
         "trials": trial_rows(),
         "peers": peer_rows(),
     }
