@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import cache
 from itertools import chain, product
-from statistics import fmean, median
+from statistics import fmean, median, mode
 from typing import Any
 
 import make_speed
@@ -183,16 +183,24 @@ def baseline_rows(few: bool) -> list[Row]:
     ]
 
 
-def more_seeds(*methods: Runs) -> str:
-    """Return how many seeds ran, where all methods have as many and more than one."""
+def most_seeds(*methods: Runs) -> int:
+    """Return how many seeds most methods ran, of those that learn."""
     learned = [runs for runs in methods if runs[0]["options"]["method"] not in UNLEARNED]
-    (most, *others) = {len(runs) for runs in learned or methods}
-    return f", {most} seeds" if most > 1 and not others else ""
+    return mode(len(runs) for runs in learned or methods)
+
+
+def more_seeds(*methods: Runs) -> str:
+    """Return how many seeds most methods ran, where that is more than one."""
+    most = most_seeds(*methods)
+    return f", {most} seeds" if most > 1 else ""
 
 
 def own_seeds(methods: dict[str, Runs], method: str) -> str:
-    """Return how many seeds a method ran, where its column does not say so."""
-    return "" if more_seeds(*methods.values()) else more_seeds(methods[method])
+    """Return how many seeds a method ran, where its column says another number."""
+    own = len(methods[method])
+    if method in UNLEARNED or own == most_seeds(*methods.values()):
+        return ""
+    return f", {own} seed{'s' * (own > 1)}"
 
 
 def discriminator_rows() -> list[Row]:
