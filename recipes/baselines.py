@@ -89,8 +89,8 @@ def baseline(options: Options) -> dict[str, Any]:
     results = measured(learned, options)
     if curve := learning_curve(stage.run, options.method):
         results["curve"] = curve
-    trained_by = stage.run.stage(f"baseline_{options.method}").result or {}
-    if said := trained_by.get("discriminator"):
+    trained_in = stage.run.stage(f"baseline_{options.method}").result or {}
+    if said := trained_in.get("discriminator"):
         results["discriminator"] = said
     finish(options, stage, {"of": asked, "results": results})
     return results

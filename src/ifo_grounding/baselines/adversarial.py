@@ -30,6 +30,7 @@ from ifo_grounding.baselines.access import (
 from ifo_grounding.baselines.rewards import AbsorbingState, DiscriminatorReward, StopReward
 from ifo_grounding.data import Demonstrations
 from ifo_grounding.errors import UserError, share
+from ifo_grounding.modules import beside
 from ifo_grounding.networks import (
     make_instruction_classifier,
     make_inverse,
@@ -189,7 +190,7 @@ class Adversary(AdversarialUpdates):
     def probability(self, seen: Any) -> float:
         """Return the mean probability that demonstrations, of the same access, are demonstrated."""
         with torch.no_grad():
-            logits = self.loss._logits(self.demonstrated(seen)[:])
+            logits = self.loss._logits(beside(self.demonstrated(seen)[:], self.loss))
         return float(logits.sigmoid().mean())
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:
