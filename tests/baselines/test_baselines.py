@@ -21,6 +21,7 @@ from ifo_grounding.baselines import (
     GAIfO,
     SteppableDemonstrations,
     StopReward,
+    adversarial,
     steps_of_policy,
 )
 from ifo_grounding.config import SelfExamineConfig
@@ -295,11 +296,14 @@ def test_windows_hold_as_many_frames_as_those_of_phase_2():
     assert AGILE.practice(phase2) == phase2
 
 
-def test_a_method_has_a_learning_rate_of_its_own(sources):
+def test_a_method_has_a_learning_rate_of_its_own(sources, monkeypatch):
     def rate_of(**given):
         return GAIfO(sources["frames"], **SMALL, **given).optimizer.param_groups[0]["lr"]
 
     assert (rate_of(), rate_of(lr=0.5)) == (3e-4, 0.5)
+    monkeypatch.setattr(adversarial, "MANY", len(sources["frames"]))
+    assert (rate_of(), rate_of(lr=0.5)) == (1e-3, 0.5)
+    assert GAIL(sources["actions"], **SMALL).optimizer.param_groups[0]["lr"] == 1e-3
 
 
 def test_agile_needs_a_stop(sources):

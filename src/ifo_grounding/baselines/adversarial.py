@@ -43,6 +43,9 @@ from ifo_grounding.training import AdversarialUpdates
 from ifo_grounding.training.loop import Metrics
 from ifo_grounding.transforms.reward import RewardTransform
 
+MANY = 1000
+"""Demonstrations from which on they are many, as for the budgets of recipes."""
+
 
 class DiscriminatorLoss(SupervisedLoss):
     """Binary cross entropy of demonstrations (1) against the policy (0).
@@ -139,6 +142,8 @@ class Adversary(AdversarialUpdates):
     """Share of the policy's steps that is left out."""
     lr: float
     """Learning rate of the discriminator by default, the best of three on validation scenes."""
+    lr_of_many: float | None = None
+    """That with :data:`MANY` demonstrations, where it is another one."""
     window: int | None = 64
     """Steps of each world per iteration, where every step is paid: in windows hardly longer than
     episodes, even a perfect policy would stop less often than demonstrations do."""
@@ -168,7 +173,8 @@ class Adversary(AdversarialUpdates):
         # Part of the loss, so that a checkpoint holds what it has counted.
         loss.absorbing = getattr(self.reward, "absorbing", None)
         decay = prior / len(demos)
-        rate = self.lr if lr is None else lr
+        own = self.lr_of_many if self.lr_of_many and len(demos) >= MANY else self.lr
+        rate = own if lr is None else lr
         super().__init__(loss, self.demonstrated(seen), steps, rate, batch_size, decay)
 
     def __call__(self, batch: TensorDictBase) -> Metrics:
@@ -259,7 +265,7 @@ class GAIfO(Adversary):
     """
 
     access: type[Any] = Demonstrations
-    lr = 3e-4
+    lr, lr_of_many = 3e-4, 1e-3
 
     def demonstrated(self, seen: Demonstrations) -> TensorDictReplayBuffer:  # noqa: D102
         return transitions_of(seen)
