@@ -205,17 +205,23 @@ def own_seeds(methods: dict[str, Runs], method: str) -> str:
 
 def discriminator_rows() -> list[Row]:
     """Return what discriminators say in the end: of demonstrations, unseen ones, the policy's."""
-    rows: dict[str, Row] = {}
+    found: dict[tuple[Made, str], str] = {}
     for key, methods in by_method().items():
         for method, runs in methods.items():
             said = [r["results"]["discriminator"] for r in runs if "discriminator" in r["results"]]
             if said and "agile" not in method:  # which spares what of the policy's it likes best
-                means = [
+                means = (
                     fmean(of[who] for of in said) for who in ("demonstrated", "unseen", "policy")
-                ]
-                row = rows.setdefault(method, {"method": f"`{method}`"})
-                row[title_of(*key)] = ", ".join(f"{100 * mean:.0f}%" for mean in means)
-    return list(rows.values())
+                )
+                found[key, method] = ", ".join(f"{100 * mean:.0f}%" for mean in means)
+    columns = list(dict.fromkeys(key for key, _ in found))
+    return [
+        {
+            "method": f"`{method}`",
+            **{title_of(*key): found.get((key, method), "") for key in columns},
+        }
+        for method in dict.fromkeys(method for _, method in found)
+    ]
 
 
 def trial_rows() -> list[Row]:
