@@ -24,14 +24,13 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from ifo_grounding.cli import recipes_folder
 from ifo_grounding.config import PASSING, Options
+from ifo_grounding.data.demonstrations import FEW
 from ifo_grounding.data.recorded import count_recorded
 from ifo_grounding.errors import UserError, did_you_mean
 from ifo_grounding.training.checkpoint import leaves, written
 from ifo_grounding.training.run import Run
 from ifo_grounding.worlds import BabyAI, Grid, Gymnasium
 
-FEW = 1000
-"""With fewer demonstrations than this, the budget of ``strong`` is ``few``, unless one is named."""
 LARGEST = 2**31 - 1  # of whole numbers that are no seeds
 CONFIG = "config"
 """Name of the YAML that all recipes begin with."""

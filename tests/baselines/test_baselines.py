@@ -301,7 +301,7 @@ def test_a_method_has_a_learning_rate_of_its_own(sources, monkeypatch):
         return GAIfO(sources["frames"], **SMALL, **given).optimizer.param_groups[0]["lr"]
 
     assert (rate_of(), rate_of(lr=0.5)) == (3e-4, 0.5)
-    monkeypatch.setattr(adversarial, "MANY", len(sources["frames"]))
+    monkeypatch.setattr(adversarial, "FEW", len(sources["frames"]))
     assert (rate_of(), rate_of(lr=0.5)) == (1e-3, 0.5)
     assert GAIL(sources["actions"], **SMALL).optimizer.param_groups[0]["lr"] == 1e-3
 

@@ -29,8 +29,8 @@ from ifo_grounding.baselines.access import (
 )
 from ifo_grounding.baselines.rewards import AbsorbingState, DiscriminatorReward, StopReward
 from ifo_grounding.data import Demonstrations
+from ifo_grounding.data.demonstrations import FEW
 from ifo_grounding.errors import UserError, share
-from ifo_grounding.modules import beside
 from ifo_grounding.networks import (
     make_instruction_classifier,
     make_inverse,
@@ -41,10 +41,8 @@ from ifo_grounding.networks.warm_start import remember
 from ifo_grounding.objectives.base import SupervisedLoss
 from ifo_grounding.training import AdversarialUpdates
 from ifo_grounding.training.loop import Metrics
+from ifo_grounding.transforms.base import rows_of
 from ifo_grounding.transforms.reward import RewardTransform
-
-MANY = 1000
-"""Demonstrations from which on they are many, as for the budgets of recipes."""
 
 
 class DiscriminatorLoss(SupervisedLoss):
@@ -143,7 +141,7 @@ class Adversary(AdversarialUpdates):
     lr: float
     """Learning rate of the discriminator by default, the best of three on validation scenes."""
     lr_of_many: float | None = None
-    """That with :data:`MANY` demonstrations, where it is another one."""
+    """That with 1,000 demonstrations or more, where it is another one."""
     window: int | None = 64
     """Steps of each world per iteration, where every step is paid: in windows hardly longer than
     episodes, even a perfect policy would stop less often than demonstrations do."""
@@ -173,7 +171,7 @@ class Adversary(AdversarialUpdates):
         # Part of the loss, so that a checkpoint holds what it has counted.
         loss.absorbing = getattr(self.reward, "absorbing", None)
         decay = prior / len(demos)
-        own = self.lr_of_many if self.lr_of_many and len(demos) >= MANY else self.lr
+        own = self.lr if len(demos) < FEW else self.lr_of_many or self.lr
         rate = own if lr is None else lr
         super().__init__(loss, self.demonstrated(seen), steps, rate, batch_size, decay)
 
@@ -195,9 +193,9 @@ class Adversary(AdversarialUpdates):
 
     def probability(self, seen: Any) -> float:
         """Return the mean probability that demonstrations, of the same access, are demonstrated."""
-        with torch.no_grad():
-            logits = self.loss._logits(beside(self.demonstrated(seen)[:], self.loss))
-        return float(logits.sigmoid().mean())
+        steps = self.demonstrated(seen)[:]
+        read = [rows_of(steps, key) for key in self.network.in_keys]
+        return float(self.reward._score(read).sigmoid().mean())
 
     def demonstrated(self, seen: Any) -> TensorDictReplayBuffer:
         """Return the demonstrated steps that are told apart from the policy's."""

@@ -22,6 +22,8 @@ from ifo_grounding.errors import UserError, whole
 from ifo_grounding.tasks.vocabulary import Vocabulary, check_vocabulary, words_of
 
 KIND = "ifo-grounding demonstrations"
+FEW = 1000
+"""With fewer demonstrations than this some defaults are other ones, of budgets and rates."""
 
 
 class Demonstrations:
