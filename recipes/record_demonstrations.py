@@ -34,8 +34,9 @@ def record(options: Options) -> dict:
         compare_colours(world, demos.first_frames()[:SHOWN], options.seed)
     else:
         demos, truth = world.demonstrate(n, seed=options.seed, progress=options.progress)
+    world.vocabulary = world.vocabulary or demos.vocabulary
+    world.image_shape("simulator", seed=options.seed)
     if world.rewarded:
-        world.vocabulary = world.vocabulary or demos.vocabulary
         try_out(world, options.seed)
     if truth is not None:
         truth.save(stage.run / TRUTH)
@@ -51,6 +52,7 @@ def try_out(world: World, seed: int) -> None:
         UserError: where none can begin, where one seed shows several scenes, or where the names of
             actions are not as many as the actions.
     """
+    world.image_shape("instructed", seed=seed, stream="validation")
     env = world.instructed(1, seed=seed, stream="validation")
     if world.actions and hasattr(env.action_spec, "n"):
         check_names_of_actions(world.actions, env.action_spec.n)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv, UnaryTransform
+from torchrl.envs import ExcludeTransform, ToTensorImage, TransformedEnv, UnaryTransform
 
 from envs import dial as dial_module
 from ifo_grounding import networks
@@ -175,6 +175,27 @@ def test_a_world_that_cannot_be_is_refused_first(options, dial, tmp_path, said, 
     with pytest.raises(UserError, match=refused):
         record(options(dial, *said))
     assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+@pytest.mark.parametrize("method", ["simulator", "instructed"])
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        (lambda env: None, "NoneType with no pixels"),
+        (lambda env: TransformedEnv(env, ExcludeTransform("pixels")), "with no pixels"),
+        (lambda env: TransformedEnv(env, ToTensorImage(in_keys=["pixels"])), "torch.float32"),
+        (lambda env: PickAndPlaceEnv("move", num_envs=3), r"uint8\[3, 3, 48, 48\]"),
+    ],
+)
+def test_a_world_that_shows_no_pixels_is_refused_first(
+    options, monkeypatch, method, returned, said
+):
+    from record_demonstrations import record
+
+    made = getattr(Grid, method)
+    monkeypatch.setattr(Grid, method, lambda self, *n, **how: returned(made(self, *n, **how)))
+    with pytest.raises(UserError, match=rf"Grid.{method}\(1, ...\) returned .*{said}"):
+        record(options())
 
 
 def test_a_world_that_makes_no_demonstrations_says_what_to_give(options, dial):

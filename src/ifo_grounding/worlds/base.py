@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -123,6 +124,23 @@ class World(ABC):
         """
         raise UserError(f"{type(self).__name__} has no demonstrator to compare with")
 
+    def image_shape(self, method: str, **options: Any) -> tuple[int, ...]:
+        """Return the shape [C, H, W] of the images that ``simulator`` or ``instructed`` shows.
+
+        Raises:
+            UserError: where it returns no environment of batch size [1] with pixels.
+        """
+        env = getattr(self, method)(1, **options)
+        pixels = env.observation_spec.get(keys.PIXELS, None) if isinstance(env, EnvBase) else None
+        if pixels is None or pixels.dtype != torch.uint8 or pixels.shape[:-3] != (1,):
+            shown = "no pixels" if pixels is None else f"pixels {pixels.dtype}{[*pixels.shape]}"
+            raise UserError(
+                f"{type(self).__name__}.{method}(1, ...) returned {type(env).__name__} with "
+                f"{shown}: let it return a TorchRL environment of batch size [1] whose pixels are "
+                "uint8 [1, C, H, W]"
+            )
+        return tuple(pixels.shape[1:])
+
     def read(self, folder: str | Path, progress: bool = False) -> Demonstrations:
         """Read demonstrations that were recorded elsewhere.
 
@@ -139,7 +157,7 @@ class World(ABC):
                 f"instructions in {folder} have another vocabulary than the world: record them "
                 "with that of the world"
             )
-        shown = tuple(self.simulator(1, seed=0).observation_spec[keys.PIXELS].shape[1:])
+        shown = self.image_shape("simulator", seed=0)
         if demos.image_shape != shown:
             raise UserError(
                 f"frames in {folder} are {list(demos.image_shape)}, those of the simulator "
