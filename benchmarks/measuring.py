@@ -42,8 +42,6 @@ class Row:
     name: str
     unit: str
     contenders: dict[str, Once]
-    reach: dict[str, float] = field(default_factory=dict)
-    """What is asked for: of our rate (``rate``), or of its ratio to a contender (its name)."""
     note: str = ""
     facts: dict[str, float] = field(default_factory=dict)
     """What else was found, such as megabytes."""
@@ -70,7 +68,6 @@ class Row:
             "unit": self.unit,
             "rates": {name: spread(values) for name, values in rates.items()},
             "ratios": ratios,
-            "reach": self.reach,
             "peak_mb": memory,
             "facts": self.facts,
             "note": self.note,

@@ -102,7 +102,6 @@ def world_step() -> Row:
             "not compiled": finished(lambda: play(step, 1)),
             **peer.contender("step"),
         },
-        {"rate": 25e6, "navix": 4},
         "ours by torch.compile, five steps at a time, as navix is by JAX, all at once; navix: an "
         "empty room of 6x6 cells, which holds no objects",
         peers=[peer],
@@ -140,7 +139,6 @@ def world_pixels() -> Row:
             **peers[0].contender("pixels"),
             **peers[1].contender("pixels"),
         },
-        {"rate": 1e6, "navix": 3, "minigrid": 400},
         "ours draws the cells that changed; 48x48 pixels here and in MiniGrid, 192x192 in navix, "
         "whose tiles are fixed",
         peers=list(peers),
@@ -171,7 +169,6 @@ def env_rollout() -> Row:
         "PickAndPlaceEnv.rollout with resets, batch 1,024",
         "frames/s",
         {**ours(rollout), "without TensorDict": finished(simulate)},
-        {"rate": 400e3},
         "a random policy, which ends every sixth episode at each step",
     )
 
@@ -219,7 +216,6 @@ def many_worlds(batch: int, drawn: bool) -> Row:
         f"step, reset{' and pixels' if drawn else ''}, batch {batch:,}",
         "steps/s",
         contenders,
-        {"rate": 10e6 if drawn else 100e6} if on_gpu() else {},
         "a random policy, which ends every sixth episode at each step; new scenes are drawn on the "
         "way; on a GPU a step with its reset is one CUDA graph",
     )
@@ -241,7 +237,6 @@ def gymnasium_vector() -> Row:
         "Gymnasium vector env, 1,024 worlds",
         "frames/s",
         {**ours(work), **peer.contender("vector")},
-        {"rate": 300e3},
         "MiniGrid: SyncVectorEnv of 64 worlds, whose rate does not depend on their number",
         peers=[peer],
     )
@@ -289,7 +284,6 @@ def collector(preset: str, batch: int, steps: int) -> Row:
             "the policy alone": finished(infer),
             "drawn in pixels": finished(functools.partial(collect, drawn)),
         },
-        {"the policy alone": 0.8, **({"rate": 3e6} if batch == 16_384 else {})},
         "ours in codes, as self-examination collects; the policy alone: on the same observations",
     )
 
@@ -322,7 +316,6 @@ def sampler() -> Row:
         "reset with InstructionSampler, pool of 500",
         "pairs/s",
         {**ours(reset), "the classifier alone": finished(score)},
-        {"the classifier alone": 0.7},
     )
 
 
@@ -345,8 +338,7 @@ def imitation(preset: str) -> Row:
         return size * steps
 
     if preset == "strong":
-        reach = {"rate": 1e6 if on_gpu() else 16e3}
-        return Row(f"imitation, preset strong, batch {size:,}", "samples/s", ours(work), reach)
+        return Row(f"imitation, preset strong, batch {size:,}", "samples/s", ours(work))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "data.npz"
         batch = buffer.sample(4096).cpu()
@@ -362,7 +354,6 @@ def imitation(preset: str) -> Row:
             **peer.contender("train"),
             **peer.contender("train ours", "imitation with our layers"),
         },
-        {"rate": 30e3, "imitation": 5},
         "the package imitation: BC with the same network, data and batch size, the network in plain"
         " PyTorch or of our layers, which compute what repeats once",
         peers=[peer],
@@ -377,7 +368,7 @@ def labelling() -> Row:
         label_demonstrations(demos, inverse)
         return demos.transitions
 
-    return Row("labelling of demonstrations", "pairs/s", ours(work), {"rate": 60e3})
+    return Row("labelling of demonstrations", "pairs/s", ours(work))
 
 
 def random_steps() -> Row:
@@ -467,7 +458,7 @@ def stream() -> dict[str, float]:
     }
 
 
-def whole(task: str, count: int, asked: str) -> Row:
+def whole(task: str, count: int) -> Row:
     """Train both phases as `ifo-grounding demo` does, from random steps to the practised policy."""
     with tempfile.TemporaryDirectory() as home:
         recipe = ROOT / "recipes" / "two_phase.py"
@@ -486,8 +477,7 @@ def whole(task: str, count: int, asked: str) -> Row:
         f"both phases on {task}, from nothing",
         "s",
         {},
-        note=f"preset strong, {count:,} demonstrations, success of 2,000 evaluation scenes; asked: "
-        + asked,
+        note=f"preset strong, {count:,} demonstrations, success of 2,000 evaluation scenes",
         facts={
             "seconds, without evaluation": seconds,
             "% success, phase 1": 100 * success["phase1"],
@@ -521,11 +511,11 @@ ROWS: dict[str, Callable[[], Row]] = {
     "recording": recording,
     "memory": memory,
     "streaming": streaming,
-    "whole": functools.partial(whole, "move", 3000, "99% within 180 seconds"),
-    "whole-udlr": functools.partial(whole, "pick-udlr", 200, "60 seconds"),
+    "whole": functools.partial(whole, "move", 3000),
+    "whole-udlr": functools.partial(whole, "pick-udlr", 200),
 }
 ON_GPU = ("worlds", "worlds-pixels", "collector-strong", "imitation-strong", "whole-udlr")
-"""Rows that are measured on a GPU where none are named: of them speeds there are asked."""
+"""Rows that are measured on a GPU where none are named."""
 ON_CPU = tuple(name for name in ROWS if name != "whole-udlr")
 """Rows that are measured on a CPU where none are named."""
 

@@ -24,19 +24,12 @@ def measured(device: str) -> dict[str, dict[str, Any]]:
 
 
 def rate_row(row: dict[str, Any]) -> dict[str, str]:
-    """Return our rate of one thing, how many times as fast as others it is, and what was asked."""
+    """Return our rate of one thing, and how many times as fast as others it is."""
     rates, ratios = row["rates"], row["ratios"]
-    asked = []
-    for name, value in row["reach"].items():
-        found = rates[OURS] if name == "rate" else ratios.get(name)
-        wanted = short(value) if name == "rate" else f"{value:g} times {name}"
-        verdict = "not run" if found is None else "yes" if found["median"] >= value else "no"
-        asked.append(f"{wanted}: {verdict}")
     return {
         "what": f"{row['name']}, {row['unit']}",
         "rate": between(rates[OURS]),
         "times as fast as": "<br>".join(f"{name}: {between(r)}" for name, r in ratios.items()),
-        **({"asked": "<br>".join(asked)} if asked else {}),
     }
 
 
@@ -85,9 +78,7 @@ def of_scale() -> str:
         for against, ratio in row["ratios"].items():
             (ours,) = row["rates"].keys() - row["ratios"].keys()
             line = {"what": f"{row['name']}: {ours}", "times as fast as": against}
-            lines.append(
-                {**line, "measured": between(ratio), "asked": row["reach"].get(against, "–")}
-            )
+            lines.append({**line, "measured": between(ratio)})
     limit, model = found["growth"]["limit"], []
     for row in found["growth"]["rows"][::2]:
         line = {"workers": f"{row['workers']}", "frames/s": short(row["frames/s"])}
@@ -101,8 +92,7 @@ def of_scale() -> str:
 
 
 def tables() -> dict[str, str]:
-    """Return the tables of two cores, for which speeds are asked, and of a GPU."""
-    there = {name: {**row, "reach": {}} for name, row in measured("cuda").items()}
+    """Return the tables of two cores, and of a GPU."""
     here = measured("cpu")
-    gpu = on_device(there, said=here)
+    gpu = on_device(measured("cuda"), said=here)
     return {"speed": on_device(here), "speed-gpu": gpu, "scale": of_scale()}
