@@ -213,7 +213,8 @@ def discriminator_rows() -> list[Row]:
                 means = (
                     fmean(of[who] for of in said) for who in ("demonstrated", "unseen", "policy")
                 )
-                found[key, method] = ", ".join(f"{100 * mean:.0f}%" for mean in means)
+                seeds = f"; {len(said)} seeds" if len(said) > 1 else ""
+                found[key, method] = ", ".join(f"{100 * mean:.0f}%" for mean in means) + seeds
     columns = list(dict.fromkeys(key for key, _ in found))
     return [
         {

@@ -12,8 +12,8 @@ from _shared import (
     POLICIES,
     REFERENCE,
     TRANSITIONS,
-    TRUTH,
     build,
+    checksums,
     coded_simulator,
     finish,
     load_demonstrations,
@@ -31,7 +31,13 @@ from _shared import (
     write_result,
 )
 from evaluate import measured_success, played, success_results
-from imitate import imitate_transitions, new_policy, split_transitions
+from imitate import (
+    imitate_transitions,
+    imitate_truth,
+    new_policy,
+    split_transitions,
+    true_actions,
+)
 from self_examine import chosen_starts
 from torchrl.data import ReplayBufferEnsemble
 from torchrl.envs import TransformedEnv
@@ -53,9 +59,10 @@ from ifo_grounding.baselines import (
 from ifo_grounding.baselines.config import METHODS, PLANNED
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import STAGES, Options
-from ifo_grounding.data import Collected, Truth, label_demonstrations
+from ifo_grounding.data import Collected, label_demonstrations
 from ifo_grounding.errors import UserError
 from ifo_grounding.evaluation import success_rate
+from ifo_grounding.files import read_json, write_json
 from ifo_grounding.networks import make_value
 from ifo_grounding.objectives import InverseLoss
 from ifo_grounding.report.results import by_scene
@@ -65,6 +72,10 @@ ENTROPY = 0.01
 """Weight of the entropy bonus of a policy that learns from a discriminator."""
 UNSEEN = 200
 """Demonstrations of validation scenes that a discriminator is asked about in the end."""
+MADE = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
+"""Files of methods that are stages of a run."""
+ACTED = ("bc", "lc-rl", "gail", "gail+bc")
+"""Methods that need true actions."""
 ROWS = 32
 """Worlds through which LC-RL walks side by side."""
 ADVERSARIES: dict[str, type[Adversary]] = {
@@ -81,15 +92,19 @@ def baseline(options: Options) -> dict[str, Any]:
     for name, make in stages_of(options).items():
         if STAGES.index(name) <= STAGES.index(METHODS[options.method]):
             make(options)
+        if name == STAGES[0] and options.method in ACTED:
+            true_actions(open_run(options))  # where there are none, that is said before phase 1
+    run = open_run(options)
     learned = trained(options)
-    asked = {"options": plain(options.evaluate)}
+    policy = checksums(run).get(file_of(options.method))  # trained anew, it is measured anew
+    asked = {"options": plain(options.evaluate), "policy": policy}
     stage = open_stage(options, f"evaluate_{options.method}", of=asked)
     if stage.result is not None:
         return stage.result["results"]
     results = measured(learned, options)
-    if curve := learning_curve(stage.run, options.method):
+    if curve := learning_curve(run, options.method):
         results["curve"] = curve
-    trained_in = stage.run.stage(f"baseline_{options.method}").result or {}
+    trained_in = run.stage(f"baseline_{options.method}").result or {}
     if said := trained_in.get("discriminator"):
         results["discriminator"] = said
     finish(options, stage, {"of": asked, "results": results})
@@ -100,7 +115,7 @@ def measured(learned: Any, options: Options) -> dict[str, Any]:
     """Measure what a method has learned on the evaluation scenes."""
     scenes = options.evaluate
     if isinstance(learned, LCRL):
-        env, _ = played(options, scenes.episodes)
+        env, _ = played(replace(options, device="cpu"), scenes.episodes)  # where it plans
         env.set_seed(scenes.seed)
         return {options.method: by_scene(learned.success(env, scenes.episodes))}
     if options.method == "expert":
@@ -137,25 +152,8 @@ def trained(options: Options) -> Any:
         if stage.result is None:
             train = bco_alpha if method == "bco-alpha" else adversarial
             train(options, stage)
-    made = {"bc": REFERENCE, "bco": POLICIES["phase1"], "ours": POLICIES["phase2"]}
-    if method in made:
-        return load_network(run, made[method], options)
-    return load_network(run, file_of(method), options, ("baselines", f"baseline_{method}"))
-
-
-def imitate_truth(options: Options) -> dict:
-    """Imitate as phase 1 does, with the demonstrator's actions in place of labels."""
-    stage = open_stage(options, "imitate_truth")
-    if stage.result is not None:
-        return stage.result
-    if not (stage.run / TRUTH).exists():
-        raise UserError(
-            f"{stage.run / TRUTH} is missing: demonstrations that were recorded elsewhere hold no "
-            "actions to imitate"
-        )
-    demos, truth = load_demonstrations(stage.run), Truth.load(stage.run / TRUTH)
-    seen, held_out = split_transitions(demos, truth.actions, options.imitate.held_out)
-    return imitate_transitions(options, stage, seen, held_out, REFERENCE)
+    made_by = () if method in MADE else ("baselines", f"baseline_{method}")
+    return load_network(run, file_of(method), options, made_by)
 
 
 def references(options: Options) -> dict[str, Any]:
@@ -167,8 +165,8 @@ def references(options: Options) -> dict[str, Any]:
 
 
 def file_of(method: str) -> str:
-    """Return the file of the policy of an adversarial method."""
-    return f"policy-{method}.safetensors"
+    """Return the file of what a method has learned."""
+    return MADE.get(method, f"policy-{method}.safetensors")
 
 
 def bco_alpha(options: Options, stage: Stage) -> None:
@@ -204,7 +202,7 @@ def planned(options: Options) -> LCRL:
         raise UserError(f"lc-rl plans the arm's cells: task={' or task='.join(PLANNED)}")
     run, demos = stage.run, load_demonstrations(stage.run)
     env = world.steppable(ROWS, seed=options.seed)
-    truth = Truth.load(run.need(TRUTH, "record_demonstrations"))
+    truth = true_actions(run)
     seen = SteppableActionDemonstrations(SteppableDemonstrations(demos, env), truth)
     how = {"seed": options.seed, **options.networks.changed()}
     planner = LCRL(seen, options.world["size"], options.preset, **how)
@@ -219,13 +217,19 @@ def planned(options: Options) -> LCRL:
 
 
 def trained_by(options: Options) -> Stage:
-    """Return the stage that trains a method; one that was trained otherwise is refused."""
+    """Return the stage that trains a method; one that was begun otherwise is refused."""
     stage, section = open_stage(options, f"baseline_{options.method}"), plain(options.baseline)
-    if stage.result is not None and stage.result["of"] != section:
+    begun, made = stage.checkpoint.with_name("begun.json"), section
+    if stage.result is not None:
+        made = stage.result["of"]
+    elif begun.exists() and any(begun.parent.glob("*.pt")):
+        made = read_json(begun, dict)
+    if made != section:
         raise UserError(
-            f"{options.method} was trained in the run {options.run} with {stage.result['of']}: "
-            "give another run="
+            f"{options.method} was trained in the run {options.run} with {made}: give another run="
         )
+    if stage.result is None:
+        write_json(begun, section)
     return stage
 
 
@@ -255,14 +259,15 @@ def adversarial(options: Options, stage: Stage) -> None:
     )
     read_fast(adversary.demonstrations, options)
     reading_codes(adversary.network, options)
+    iterations = math.ceil(section.frames / rounds)
     config = replace(
         practice,
-        iterations=math.ceil(section.frames / rounds),
+        iterations=iterations,
         anneal=False,  # the reward goes on changing
         entropy=ENTROPY,
-        value_warmup=practice.value_warmup if begun else 0,
+        value_warmup=min(practice.value_warmup, iterations - 1) if begun else 0,
         select_every=0,
-        evaluate_every=max(1, math.ceil(section.frames / rounds / 20)),
+        evaluate_every=math.ceil(iterations / 20),
     )
     if method == "agile":
         env = seen.starts(options.seed)
@@ -298,9 +303,7 @@ def access(options: Options, run: Run, worlds: int) -> Any:
     demos, world = load_demonstrations(run), world_of(options)
     kind = ADVERSARIES[options.method].access
     if kind is ActionDemonstrations:
-        if not (run / TRUTH).exists():
-            raise UserError(f"{options.method} needs true actions, and these were not recorded")
-        return ActionDemonstrations(demos, Truth.load(run / TRUTH))
+        return ActionDemonstrations(demos, true_actions(run))
     if kind is SteppableDemonstrations:
         env = world.steppable(worlds, seed=options.seed, device=options.device)
         return SteppableDemonstrations(demos, env)

@@ -5,6 +5,8 @@ from typing import Any
 
 from _shared import (
     POLICIES,
+    REFERENCE,
+    TRUTH,
     build,
     fit_options,
     keep,
@@ -20,7 +22,7 @@ from torchrl.modules import ProbabilisticActor
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
-from ifo_grounding.data import Demonstrations, labelled_buffer
+from ifo_grounding.data import Demonstrations, Truth, labelled_buffer
 from ifo_grounding.errors import UserError
 from ifo_grounding.networks import make_policy
 from ifo_grounding.objectives import ImitationLoss
@@ -34,6 +36,30 @@ def imitate(options: Options) -> dict:
         return stage.result
     seen, held_out = labelled_demonstrations(stage.run, options.imitate.held_out)
     return imitate_transitions(options, stage, seen, held_out, POLICIES["phase1"])
+
+
+def imitate_truth(options: Options) -> dict:
+    """Imitate as phase 1 does, with the demonstrator's actions in place of labels."""
+    stage = open_stage(options, "imitate_truth")
+    if stage.result is not None:
+        return stage.result
+    demos, truth = load_demonstrations(stage.run), true_actions(stage.run)
+    seen, held_out = split_transitions(demos, truth.actions, options.imitate.held_out)
+    return imitate_transitions(options, stage, seen, held_out, REFERENCE)
+
+
+def true_actions(run: Run) -> Truth:
+    """Load the demonstrator's actions.
+
+    Raises:
+        UserError: where they were not recorded.
+    """
+    if not (run / TRUTH).exists():
+        raise UserError(
+            f"{run / TRUTH} is missing: demonstrations that were recorded elsewhere hold no true "
+            "actions to learn from"
+        )
+    return Truth.load(run / TRUTH)
 
 
 def imitate_transitions(

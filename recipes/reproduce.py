@@ -166,12 +166,16 @@ def of_phase(
         f"tables/{task}-{n}-{preset}-{phase}-seed{seed}.json",
         {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n},
         {"variant": phase},
-        options.all,
-        options.preset[preset],
-        options.preset_of_task.get(preset, {}).get(task, {}),
+        *of_tables(options, preset, task),
         options.phase[phase],
         base=base,
     )
+
+
+def of_tables(options: ReproduceOptions, preset: str, task: str) -> list[Mapping[str, Any]]:
+    """Return the options of all pieces of a preset and task."""
+    of_task = options.preset_of_task.get(preset, {}).get(task, {})
+    return [options.all, options.preset[preset], of_task]
 
 
 def of_methods(
@@ -184,8 +188,9 @@ def of_methods(
     """
     more = "" if options.frames == ReproduceOptions.frames else f"{options.frames / 1e6:g}M"
     name = "-".join(filter(None, (task, str(n), preset, more)))
+    as_tables = of_tables(options, preset, task) if preset == "paper" else []  # no budget is for it
     of_run = {"task": task, "preset": preset, "seed": seed, "demonstrations.n": n, **options.method}
-    of_run |= {"baseline.frames": options.frames, "world": options.preset[preset].get("world", {})}
+    of_run |= {"baseline.frames": options.frames}
     begun: dict[tuple[str, ...], str] = {}
     for method in options.tuning if options.tune else METHODS:
         if method not in options.methods or (method == "lc-rl" and task not in PLANNED):
@@ -195,7 +200,7 @@ def of_methods(
                 continue  # the same in the same scenes
             run, file = f"baselines-{name}-seed{seed}", f"baselines/{name}-{method}-seed{seed}.json"
             of_method = {"method": method, "variant": more or None}
-            yield piece(options, run, file, of_run, of_method, recipe="baselines")
+            yield piece(options, run, file, *as_tables, of_run, of_method, recipe="baselines")
             continue
         space = options.tuning[method]
         for number, values in enumerate(product(*space.values())):
@@ -204,7 +209,7 @@ def of_methods(
             variant = "-".join(filter(None, (more, f"trial{number}")))
             trial = {"method": method, "variant": variant, **dict(zip(space, values, strict=True))}
             base = begun.get(tuple(space))
-            chosen = (of_run, options.tuned, trial)
+            chosen = (*as_tables, of_run, options.tuned, trial)
             yield piece(options, run, file, *chosen, base=base, recipe="baselines")
             if all(option.startswith(BEHIND_PHASE_1) for option in space):
                 begun.setdefault(tuple(space), run)

@@ -11,7 +11,9 @@ from ifo_grounding.config import STAGES
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
 from ifo_grounding.options import options_of
+from ifo_grounding.training import Run
 from importing import recipes_importable
+from pretended_gpu import pretended_gpu
 from recipes.conftest import TINY, make_stages
 
 FEWER = (
@@ -68,6 +70,45 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
         assert not trained.exists()  # to run it again helps
 
 
+def test_an_interrupted_rival_goes_on_as_it_began_alone(practised, options, tmp_path, monkeypatch):
+    import baselines
+
+    class Killed(Exception):
+        pass
+
+    def kill(*_):
+        raise Killed
+
+    shutil.copytree(practised, tmp_path / "run")
+    given = options(*FEWER, "method=gail", "checkpoint_seconds=0")
+    monkeypatch.setattr(baselines, "save_network", kill)
+    with pytest.raises(Killed):
+        baselines.baseline(given)
+    monkeypatch.undo()
+    for other in ("baseline.lr=0.01", "baseline.steps=2"):
+        with pytest.raises(UserError, match="give another run="):
+            baselines.baseline(options(*FEWER, "method=gail", other))
+    assert baselines.baseline(given)["gail"]["rate"]["count"] == 20
+
+
+def test_a_rival_trained_anew_is_measured_anew(practised, options, tmp_path):
+    from _shared import checksums
+
+    from baselines import baseline
+
+    run = Run(shutil.copytree(practised, tmp_path / "run"))
+    measured = []
+    for lr in (1e-3, 3e-2):
+        given = options(*FEWER, "method=gail", f"baseline.lr={lr}")
+        if measured:  # what a user does who has lost the policy
+            (run / "policy-gail.safetensors").unlink()
+            with pytest.raises(UserError, match="run the recipe baselines"):
+                baseline(options(*FEWER, "method=gail", "baseline.lr=0.001"))
+        baseline(given)
+        measured.append(run.record("evaluate_gail")["result"]["of"]["policy"])
+    assert measured[0] != measured[1] == checksums(run)["policy-gail.safetensors"]
+
+
 def test_a_rival_has_the_policy_of_the_run(options, tmp_path):
     from baselines import baseline
 
@@ -92,9 +133,20 @@ def test_a_rival_that_needs_what_a_world_lacks_says_so(practised, options, tmp_p
 
     run = shutil.copytree(practised, tmp_path / "run")
     shutil.rmtree(run / "truth")
-    with pytest.raises(UserError, match="needs true actions"):
+    with pytest.raises(UserError, match="hold no true actions"):
         baseline(options(*FEWER, "method=gail"))
     with pytest.raises(UserError, match="task=move or"):
         baseline(options(*FEWER, "method=lc-rl", "task=pick", run="another"))
     with pytest.raises(UserError, match="method"):
         options("method=dagger")
+
+
+@pytest.mark.parametrize("method", ["lc-rl", "gaifo"])
+def test_a_rival_runs_on_a_gpu(method, options):
+    from baselines import baseline
+
+    few = ["imitate.steps=4", "inverse.steps=4", "instruction.steps=4", "evaluate.max_steps=4"]
+    few += ["transitions.n=100", "evaluate.audit_episodes=4"]
+    with pretended_gpu():
+        found = baseline(options(*FEWER, *few, f"method={method}", "device=cuda", run="gpu"))
+    assert found[method]["rate"]["count"] == 20

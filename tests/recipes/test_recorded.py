@@ -16,9 +16,8 @@ def demos():
 
 
 def test_recorded_demonstrations_are_learned_from(options, tmp_path, demos):
+    from imitate import imitate_truth
     from two_phase import two_phase
-
-    from baselines import imitate_truth
 
     data.save_pictures(demos, tmp_path / "shown")
     given = options(f"recorded={tmp_path / 'shown'}", "demonstrations.n=30", "until=imitate")
@@ -28,7 +27,7 @@ def test_recorded_demonstrations_are_learned_from(options, tmp_path, demos):
     assert learned.tokens.equal(demos.tokens[:30])
     assert not (tmp_path / "run" / "truth").exists()
     assert "labels" not in results and results["phase1"]["rate"]["count"] == 20
-    with pytest.raises(UserError, match="hold no actions"):
+    with pytest.raises(UserError, match="hold no true actions"):
         imitate_truth(given)
 
 

@@ -124,7 +124,9 @@ def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_pa
         assert (first.budget, first.evaluate.episodes) == (budget, 5000)
     assert chains[0][0].file == tmp_path / "results/baselines/move-200-strong-bc-seed3.json"
     (of_paper, *_) = pieces(reproduce_options("table=1", "tasks=[move]", "presets=[paper]"))
-    assert options_of(*of_paper[0].call.options).world["tile_size"] == 16  # as of other tables
+    as_tables = options_of(*of_paper[0].call.options)
+    assert (as_tables.world["tile_size"], as_tables.imitate.steps) == (16, 48_000)
+    assert (as_tables.budget, as_tables.demonstrations.n) == ("full", 200)
 
 
 def test_table_1_of_some_methods_with_more_frames_has_files_of_its_own(reproduce_options, tmp_path):

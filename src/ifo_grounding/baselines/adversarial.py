@@ -139,7 +139,7 @@ class Adversary(AdversarialUpdates):
     spare = 0.0
     """Share of the policy's steps that is left out."""
     lr: float
-    """Learning rate of the discriminator by default, the best of three on validation scenes."""
+    """Learning rate of the discriminator by default, of three tried on validation scenes."""
     lr_of_many: float | None = None
     """That with 1,000 demonstrations or more, where it is another one."""
     window: int | None = 64
