@@ -1,6 +1,7 @@
 """Record demonstrations, or read what others recorded: frames and instructions, never actions."""
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,10 +28,17 @@ TOLERATED = 0.1
 def record(options: Options) -> dict:
     stage = open_stage(options, "record_demonstrations")
     if stage.result is not None:
+        if read := stage.result.get("read"):
+            refuse_changed(options, read)
         return stage.result
     world, n = world_of(options), options.demonstrations.n
+    found: dict[str, Any] = {}
     if options.recorded:
-        demos, truth = world.read(options.recorded, progress=options.progress)[:n], None
+        found["read"] = content_of(options.recorded)
+        every, truth = world.read(options.recorded, progress=options.progress), None
+        demos = every[:n]
+        if len(demos) < len(every):
+            print(f"note: {n} of {len(every)} recorded demonstrations: demonstrations.n takes more")
         compare_colours(world, demos.first_frames()[:SHOWN], options.seed)
     else:
         demos, truth = world.demonstrate(n, seed=options.seed, progress=options.progress)
@@ -41,8 +49,24 @@ def record(options: Options) -> dict:
     if truth is not None:
         truth.save(stage.run / TRUTH)
     demos.save(stage.run / DEMONSTRATIONS)
-    counts = {"demonstrations": len(demos), "transitions": demos.transitions}
-    return finish(options, stage, {**counts, "instructions": len(demos.pool())})
+    found |= {"demonstrations": len(demos), "transitions": demos.transitions}
+    return finish(options, stage, {**found, "instructions": len(demos.pool())})
+
+
+def content_of(folder: str) -> str:
+    """Say how much a folder of recordings holds, by which a change of it shows."""
+    sizes = [path.stat().st_size for path in Path(folder).rglob("*") if path.is_file()]
+    return f"{len(sizes):,} files, {sum(sizes):,} bytes"
+
+
+def refuse_changed(options: Options, read: str) -> None:
+    """Refuse a folder of recordings that holds other files than were read, where it is there."""
+    folder = str(options.recorded)
+    if Path(folder).exists() and (now := content_of(folder)) != read:
+        raise UserError(
+            f"{folder} held {read} when the run {options.run} read it, and holds {now}: give "
+            "another run="
+        )
 
 
 def try_out(world: World, seed: int) -> None:

@@ -262,6 +262,8 @@ def reproduce(options: ReproduceOptions) -> list[Piece]:
             print("done   " if piece.file.exists() else "not run", piece.file)
         return []
     missing = [to_make(chain) for chain in chains]
+    if not any(missing):
+        print(f"all is done in {options.results}: results=FOLDER makes it anew elsewhere")
     if options.ray:
         made = {piece.call: piece for chain in missing for piece in chain}
         calls = [[piece.call for piece in chain] for chain in missing]

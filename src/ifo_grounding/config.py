@@ -213,7 +213,7 @@ class EvaluateConfig:
     audit_episodes: int = 1000
     """Episodes in which learned rewards are compared with true success."""
     max_steps: int | None = None
-    """Most actions of an episode; null leaves it to the world."""
+    """Most actions of an episode; null for the world's own limit, 10,000 at most."""
 
     def __post_init__(self) -> None:
         check_choice("mode", self.mode, (*MODES, "both"))
@@ -257,7 +257,7 @@ class Options:
     """Threads of torch. More can pay for large batches on idle cores, and change results by
     rounding."""
     run: str = "${task}-${preset}-${budget}-seed${seed}"
-    """Name of the run's folder under the home folder, or a path."""
+    """Name of a folder under ``$IFO_GROUNDING_HOME/runs``, or a path."""
     base: str | None = None
     """Another run, whose options and stages up to phase 2 a new run takes over."""
     recorded: str | None = None

@@ -302,10 +302,10 @@ def described(kind: type, values: dict[str, Any], said: set[str], above: str = "
 
 
 def _row(text: str, meaning: str) -> Iterator[str]:
-    """Write an option beside what it means."""
-    lead, under = f"  {text:<36}  ", " " * 40
-    lines = textwrap.wrap(meaning, 102, initial_indent=lead, subsequent_indent=under)
-    yield from lines or [lead.rstrip()]
+    """Write an option beside what it means, or above where it is long."""
+    lines = [""] * (len(text) > 36) + textwrap.wrap(meaning, 62)
+    yield f"  {text:<36}  {''.join(lines[:1])}".rstrip()
+    yield from (" " * 40 + line for line in lines[1:])
 
 
 def field_docs(kind: type) -> dict[str, str]:

@@ -31,6 +31,22 @@ def test_recorded_demonstrations_are_learned_from(options, tmp_path, demos):
         imitate_truth(given)
 
 
+def test_recordings_that_changed_are_another_run(options, recipes, tmp_path, demos, capsys):
+    from record_demonstrations import record
+
+    data.save_pictures(demos[:12], tmp_path / "shown")
+    given = options(f"recorded={tmp_path / 'shown'}", "demonstrations.n=10")
+    assert record(given)["demonstrations"] == 10
+    assert "10 of 12 recorded demonstrations" in capsys.readouterr().out
+    assert record(given)["demonstrations"] == 10
+    data.save_pictures(demos[:13], tmp_path / "more")
+    (tmp_path / "shown").rename(tmp_path / "before")
+    assert record(given)["demonstrations"] == 10  # what was read is kept
+    (tmp_path / "more").rename(tmp_path / "shown")
+    with pytest.raises(UserError, match=r"held .* files, .* bytes when .* another run="):
+        record(given)
+
+
 @pytest.mark.parametrize("write", [data.Demonstrations.save, data.save_pictures, data.save_lerobot])
 @pytest.mark.parametrize("cut", [0, 5])
 def test_stops_are_added_where_none_is_shown(options, recipes, tmp_path, demos, write, cut):
