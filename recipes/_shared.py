@@ -284,7 +284,9 @@ def command(name: str) -> str:
     return f"ifo-grounding {name} {shlex.join(w for w in sys.argv[1:] if '=' in w)}".strip()
 
 
-def write_result(options: Options, results: dict[str, Any], name: str) -> dict[str, Any]:
+def write_result(
+    options: Options, results: dict[str, Any], name: str, record: str = "result.json"
+) -> dict[str, Any]:
     """Write one small file that says what was measured, by which command, where and how long.
 
     Raises:
@@ -306,7 +308,7 @@ def write_result(options: Options, results: dict[str, Any], name: str) -> dict[s
         "provenance": provenance(),
         "results": results,
     }
-    write_record(run / "result.json", content)
+    write_record(run / record, content)
     if options.results:
         file = result_file(options)
         kept = read_json(file, dict, ["options"])["options"] if file.exists() else plain(options)

@@ -320,8 +320,8 @@ def validation_success(policy: Any, options: Options) -> Any:
 def main(options: Options) -> dict:
     results = baseline(options)
     if options.results:
-        variant = "-".join(filter(None, [options.variant, options.method]))
-        write_result(replace(options, variant=variant), results, "run baselines")
+        named = replace(options, variant="-".join(filter(None, [options.variant, options.method])))
+        write_result(named, results, "run baselines", f"result-{options.method}.json")
     tell({options.method: results[options.method].get("rate", results[options.method])})
     return results
 

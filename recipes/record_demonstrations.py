@@ -1,6 +1,7 @@
 """Record demonstrations, or read what others recorded: frames and instructions, never actions."""
 
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from torchrl.envs.utils import RandomPolicy
 
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
+from ifo_grounding.data import Demonstrations
 from ifo_grounding.distinct import hash_rows, words_of
 from ifo_grounding.errors import UserError, check_names_of_actions
 from ifo_grounding.evaluation import success_rate
@@ -41,9 +43,19 @@ def record(options: Options) -> dict:
             print(f"note: {n} of {len(every)} recorded demonstrations: demonstrations.n takes more")
         compare_colours(world, demos.first_frames()[:SHOWN], options.seed)
     else:
-        demos, truth = world.demonstrate(n, seed=options.seed, progress=options.progress)
+        made = world.demonstrate(n, seed=options.seed, progress=options.progress)
+        if not (isinstance(made, tuple) and [*map(type, made)][:1] == [Demonstrations]):
+            raise UserError(
+                f"{type(world).__name__}.demonstrate returned {type(made).__name__}: let it return "
+                "Demonstrations and their Truth, or None in its place"
+            )
+        demos, truth = made
     world.vocabulary = world.vocabulary or demos.vocabulary
-    world.image_shape("simulator", seed=options.seed)
+    if demos.image_shape != (shown := world.image_shape("simulator", seed=options.seed)):
+        raise UserError(
+            f"demonstrations show images of {list(demos.image_shape)}, the simulator of "
+            f"{list(shown)}: let it show the same"
+        )
     if world.rewarded:
         try_out(world, options.seed)
     if truth is not None:
@@ -55,8 +67,14 @@ def record(options: Options) -> dict:
 
 def content_of(folder: str) -> str:
     """Say how much a folder of recordings holds, by which a change of it shows."""
-    sizes = [path.stat().st_size for path in Path(folder).rglob("*") if path.is_file()]
-    return f"{len(sizes):,} files, {sum(sizes):,} bytes"
+    found = [path for each in Path(folder).iterdir() for path in (each, *each.rglob("*"))]
+    files = sorted(path for path in found if path.is_file() and not path.name.startswith("."))
+    checksum = 0
+    for path in files:  # lists as a whole: of sentences, or of checksums of what is saved
+        said = path.read_bytes() if path.suffix in (".json", ".jsonl") else b""
+        name = f"{path.relative_to(folder)} {path.stat().st_size}".encode()
+        checksum = zlib.crc32(name + said, checksum)
+    return f"{len(files):,} files of checksum {checksum:08x}"
 
 
 def refuse_changed(options: Options, read: str) -> None:
@@ -78,7 +96,7 @@ def try_out(world: World, seed: int) -> None:
     """
     world.image_shape("instructed", seed=seed, stream="validation")
     env = world.instructed(1, seed=seed, stream="validation")
-    if world.actions and hasattr(env.action_spec, "n"):
+    if hasattr(env.action_spec, "n"):
         check_names_of_actions(world.actions, env.action_spec.n)
     shown: Any = {"episodes": SCENES, "stream": "validation", "max_steps": 1}
     random = RandomPolicy(env.action_spec)

@@ -250,7 +250,7 @@ def to_make(chain: list[Piece]) -> list[Piece]:
     """
     missing = [piece for piece in chain if not piece.file.exists()]
     bases = {piece.base for piece in missing if Run(piece.call.run).options() is None}
-    gone = {base for base in bases if base and not (Run(base) / "result.json").exists()}
+    gone = {base for base in bases if base and not any(Run(base).folder.glob("result*.json"))}
     return [piece for piece in chain if piece in missing or piece.call.run in gone]
 
 

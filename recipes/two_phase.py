@@ -23,6 +23,7 @@ from ifo_grounding.attributes import untransformed
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import STAGES, Options
 from ifo_grounding.envs import GymnasiumEnv
+from ifo_grounding.errors import UserError
 from ifo_grounding.report import text_table
 from ifo_grounding.report.results import conclusion, headline
 from ifo_grounding.texts import one_line
@@ -30,6 +31,8 @@ from report import report
 
 
 def two_phase(options: Options) -> dict:
+    if options.references and options.recorded:
+        raise UserError("references=true imitates true actions: recorded= holds none, leave it out")
     last = STAGES.index(options.until or STAGES[-1])
     rewarded = world_of(options).rewarded  # what cannot be made is refused before all else
     print(

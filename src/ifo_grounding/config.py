@@ -15,6 +15,7 @@ from omegaconf import MISSING
 from ifo_grounding.baselines.config import METHODS, BaselineConfig
 from ifo_grounding.episodes import MODES
 from ifo_grounding.errors import UserError, check_choice, check_numbers, check_range, whole
+from ifo_grounding.files import check_folder
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks.config import NetworksConfig
 from ifo_grounding.objectives.instruction import UNLABELLED
@@ -312,5 +313,7 @@ class Options:
         if set("/\\\0") & set(self.variant or ""):
             raise UserError(f"variant is part of a file's name, without slashes: {self.variant!r}")
         check_device(self.device)
+        if self.results:
+            check_folder("results", Path(self.results))
         if self.recorded:
             self.recorded = str(Path(self.recorded))  # without a slash at the end, the same one

@@ -103,6 +103,16 @@ def _replace_folder(temporary: Path, path: Path) -> None:
         shutil.rmtree(retired, ignore_errors=True)
 
 
+def check_folder(name: str, path: Path) -> None:
+    """Refuse what is, or lies in, a file.
+
+    >>> check_folder("results", Path("anything"))
+    """
+    for part in (path, *path.parents):
+        if part.exists() and not part.is_dir():
+            raise UserError(f"{name}={path}: {part} is a file; name a folder")
+
+
 def write_json(path: str | Path, content: Any) -> None:
     """Write ``content`` as indented JSON, atomically; numbers that are not finite become null."""
     text = json.dumps(_finite(content), indent=2, sort_keys=True, allow_nan=False)

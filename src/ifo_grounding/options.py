@@ -178,7 +178,8 @@ def _settled(overrides: Sequence[str], new: bool = False) -> Options:
 def _demonstrations(cfg: DictConfig) -> int:
     """Return how many demonstrations are asked for: no more than were recorded elsewhere."""
     asked = int(cfg.demonstrations.n)
-    return min(asked, count_recorded(Path(cfg.recorded))) if cfg.recorded else asked
+    gone = cfg.recorded and not Path(cfg.recorded).exists() and Run(cfg.run).options()
+    return min(asked, count_recorded(Path(cfg.recorded))) if cfg.recorded and not gone else asked
 
 
 def _goes_on(cfg: DictConfig, made: dict[str, Any], named: Iterable[str]) -> DictConfig:

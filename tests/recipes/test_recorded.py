@@ -1,6 +1,7 @@
 """Demonstrations that were recorded elsewhere, through the recipes."""
 
 import re
+import shutil
 
 import pytest
 import torch
@@ -39,11 +40,15 @@ def test_recordings_that_changed_are_another_run(options, recipes, tmp_path, dem
     assert record(given)["demonstrations"] == 10
     assert "10 of 12 recorded demonstrations" in capsys.readouterr().out
     assert record(given)["demonstrations"] == 10
-    data.save_pictures(demos[:13], tmp_path / "more")
+    (tmp_path / "shown" / ".DS_Store").write_text("a desktop's")
+    assert record(given)["demonstrations"] == 10
     (tmp_path / "shown").rename(tmp_path / "before")
-    assert record(given)["demonstrations"] == 10  # what was read is kept
-    (tmp_path / "more").rename(tmp_path / "shown")
-    with pytest.raises(UserError, match=r"held .* files, .* bytes when .* another run="):
+    gone = options(f"recorded={tmp_path / 'shown'}", "demonstrations.n=10")
+    assert record(gone)["demonstrations"] == 10  # what was read is kept
+    shutil.copytree(tmp_path / "before", tmp_path / "shown")
+    said = tmp_path / "shown" / "episodes.jsonl"
+    said.write_text(said.read_text().replace("red", "der", 1))
+    with pytest.raises(UserError, match=r"held .* files of .* when .* another run="):
         record(given)
 
 

@@ -9,6 +9,7 @@ import torch
 from ifo_grounding import networks
 from ifo_grounding.cli import main
 from ifo_grounding.config import STAGES
+from ifo_grounding.data import record_demonstrations
 from ifo_grounding.envs import GymnasiumEnv
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json, write_json
@@ -182,6 +183,19 @@ def test_other_scenes_are_measured_anew_and_kept(phase_1, capsys):
         kept = read_json(phase_1 / "result.json")
         assert kept["results"]["phase1"]["rate"]["count"] == episodes
         assert kept["command"].endswith(f"evaluate.mode=greedy evaluate.episodes={episodes}")
+
+
+def test_what_could_not_be_kept_or_compared_is_refused_first(options, tmp_path):
+    from two_phase import two_phase
+
+    record_demonstrations("move", 4).save(tmp_path / "shown")
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(UserError, match=r"results=.*/file is a file; name a folder"):
+            options(f"results={folder}")
+    with pytest.raises(UserError, match="references=true imitates true actions"):
+        two_phase(options(f"recorded={tmp_path / 'shown'}", "references=true"))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_until_its_labels_is_not_evaluated(options):

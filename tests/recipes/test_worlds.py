@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from functools import partial
 
 import pytest
 import torch
@@ -26,6 +27,7 @@ class Seedless(dial_module.Dial):
         return super().reset()
 
 
+LARGER = partial(Grid.demonstrate, Grid("move", tile_size=16))
 TURN = ["imitate.context=0", "task=dial", "self_examine.iterations=1"]
 
 
@@ -184,7 +186,7 @@ def test_a_world_that_cannot_be_is_refused_first(options, dial, tmp_path, said, 
         (lambda env: None, "NoneType with no pixels"),
         (lambda env: TransformedEnv(env, ExcludeTransform("pixels")), "with no pixels"),
         (lambda env: TransformedEnv(env, ToTensorImage(in_keys=["pixels"])), "torch.float32"),
-        (lambda env: PickAndPlaceEnv("move", num_envs=3), r"uint8\[3, 3, 48, 48\]"),
+        (lambda env: PickAndPlaceEnv("move", num_envs=1), r"uint8\[1, 3, 48, 48\]"),
     ],
 )
 def test_a_world_that_shows_no_pixels_is_refused_first(
@@ -194,7 +196,26 @@ def test_a_world_that_shows_no_pixels_is_refused_first(
 
     made = getattr(Grid, method)
     monkeypatch.setattr(Grid, method, lambda self, *n, **how: returned(made(self, *n, **how)))
-    with pytest.raises(UserError, match=rf"Grid.{method}\(1, ...\) returned .*{said}"):
+    with pytest.raises(UserError, match=rf"Grid.{method}\(2, ...\) returned .*{said}"):
+        record(options())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("stop_action", 0, r"stop_action is 0, that of Grid.simulator\(...\) 5"),
+        ("actions", (), "6 actions and 0 names"),
+        ("simulator", lambda self, n: None, r"Grid.simulator\(num_envs, seed=\) cannot be called"),
+        ("demonstrate", lambda self, n, **how: None, "demonstrate returned NoneType"),
+        ("demonstrate", lambda self, n, **how: (4, 2), "demonstrate returned tuple"),
+        ("demonstrate", lambda self, n, **how: LARGER(n, **how), "3, 96, 96.*3, 48, 48"),
+    ],
+)
+def test_a_world_that_contradicts_itself_is_refused_first(options, monkeypatch, name, value, said):
+    from record_demonstrations import record
+
+    monkeypatch.setattr(Grid, name, value)
+    with pytest.raises(UserError, match=said):
         record(options())
 
 

@@ -201,3 +201,8 @@ def test_the_summary_counts_by_hand():
     assert said["learned_return"] == pytest.approx(2.5 / 3)
     assert said["stopped"] == pytest.approx(2 / 3)
     assert said["unfinished"] == pytest.approx(14 / 17)
+
+
+def test_a_policy_that_diverges_does_not_act_again():
+    with pytest.raises(UserError, match=r"diverged: loss_.* lower lr"):
+        self_examine(tiny.make_env(), *tiny.make_networks(), tiny.config(lr=1e30), seed=0)

@@ -49,8 +49,8 @@ class Loop:
                 bar.set_postfix({key: f"{metrics[key]:.3f}" for key in shown}, refresh=False)
                 bar.update()
 
-    def add(self, metrics: Metrics, step: int) -> None:
-        """Note the metrics of an iteration, and save if it is time to.
+    def check(self, metrics: Metrics, step: int) -> None:
+        """Refuse what has diverged.
 
         Raises:
             UserError: where a loss is no longer finite.
@@ -61,6 +61,14 @@ class Loop:
                 f"{self.name} diverged: {', '.join(lost)} no longer finite by step {step}; learn "
                 "with a lower lr"
             )
+
+    def add(self, metrics: Metrics, step: int) -> None:
+        """Note the metrics of an iteration, and save if it is time to.
+
+        Raises:
+            UserError: as of :meth:`check`.
+        """
+        self.check(metrics, step)
         self.history.append(metrics)
         if self.log:
             self.log(metrics, step)

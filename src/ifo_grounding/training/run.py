@@ -38,7 +38,7 @@ LOGGERS = ("csv", *EXTRAS, "none")
 OPTIONS = "config.yaml"
 TAKEN = ".taken"
 """Folder for what is copied from another run, until all of it has its place."""
-NOT_TAKEN = (OPTIONS, "logs", "checkpoints", "report", "result.json", ".*")
+NOT_TAKEN = (OPTIONS, "logs", "checkpoints", "report", "result*.json", ".*")
 """What :meth:`Run.take_over` never copies."""
 WRITTEN = ("stages", "metrics", "logs", "report", "report/pictures", "checkpoints/*")
 """Folders in a run's folder in which files are written."""

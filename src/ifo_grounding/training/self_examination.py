@@ -203,6 +203,7 @@ def improve_policy(
             batch, counted = where.collect(derive(seed, NAME, iteration))
             metrics: Metrics = {"step": float(iteration + 1), **summary(batch), **counted}
             metrics |= learner.improve(batch, iteration)
+            loop.check(metrics, iteration + 1)  # before the policy is asked to act again
             release_freed_memory()  # batches of distinct pictures differ in size and would pile up
             if adversarial:
                 metrics |= adversarial(batch)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from ifo_grounding import keys
+from ifo_grounding.attributes import attribute
 from ifo_grounding.data import Demonstrations, Truth
 from ifo_grounding.data.recorded import load_recorded
 from ifo_grounding.errors import UserError
@@ -128,18 +129,30 @@ class World(ABC):
         """Return the shape [C, H, W] of the images that ``simulator`` or ``instructed`` shows.
 
         Raises:
-            UserError: where it returns no environment of batch size [1] with pixels.
+            UserError: where it takes other arguments, or where of two worlds it returns no
+                environment of that batch size, with pixels, and with the stop of this world.
         """
-        env = getattr(self, method)(1, **options)
+        name = f"{type(self).__name__}.{method}"
+        try:
+            env = getattr(self, method)(2, **options)
+        except TypeError as error:
+            given = "".join(f", {option}=" for option in options)
+            raise UserError(f"{name}(num_envs{given}) cannot be called: {error}") from None
         pixels = env.observation_spec.get(keys.PIXELS, None) if isinstance(env, EnvBase) else None
-        if pixels is None or pixels.dtype != torch.uint8 or pixels.shape[:-3] != (1,):
+        if pixels is None or pixels.dtype != torch.uint8 or pixels.shape[:-3] != (2,):
             shown = "no pixels" if pixels is None else f"pixels {pixels.dtype}{[*pixels.shape]}"
             raise UserError(
-                f"{type(self).__name__}.{method}(1, ...) returned {type(env).__name__} with "
-                f"{shown}: let it return a TorchRL environment of batch size [1] whose pixels are "
-                "uint8 [1, C, H, W]"
+                f"{name}(2, ...) returned {type(env).__name__} with {shown}: let it return a "
+                "TorchRL environment of batch size [2] whose pixels are uint8 [2, C, H, W]"
             )
-        return tuple(pixels.shape[1:])
+        if (stop := attribute(env, "stop_action")) not in (None, self.stop_action):
+            raise UserError(
+                f"{type(self).__name__}.stop_action is {self.stop_action}, that of {name}(...) "
+                f"{stop}: let both name the action by which a policy says that it is done"
+            )
+        shape = tuple(pixels.shape[1:])
+        env.close()
+        return shape
 
     def read(self, folder: str | Path, progress: bool = False) -> Demonstrations:
         """Read demonstrations that were recorded elsewhere.
