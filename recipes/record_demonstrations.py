@@ -43,13 +43,14 @@ def record(options: Options) -> dict:
             print(f"note: {n} of {len(every)} recorded demonstrations: demonstrations.n takes more")
         compare_colours(world, demos.first_frames()[:SHOWN], options.seed)
     else:
-        made = world.demonstrate(n, seed=options.seed, progress=options.progress)
-        if not (isinstance(made, tuple) and [*map(type, made)][:1] == [Demonstrations]):
-            raise UserError(
-                f"{type(world).__name__}.demonstrate returned {type(made).__name__}: let it return "
-                "Demonstrations and their Truth, or None in its place"
-            )
-        demos, truth = made
+        match world.demonstrate(n, seed=options.seed, progress=options.progress):
+            case (Demonstrations() as demos, truth):
+                pass
+            case other:
+                raise UserError(
+                    f"{type(world).__name__}.demonstrate returned {type(other).__name__}: let it "
+                    "return Demonstrations and their Truth, or None in its place"
+                )
     world.vocabulary = world.vocabulary or demos.vocabulary
     if demos.image_shape != (shown := world.image_shape("simulator", seed=options.seed)):
         raise UserError(
