@@ -205,8 +205,9 @@ def own_seeds(methods: dict[str, Runs], method: str) -> str:
 
 def discriminator_rows() -> list[Row]:
     """Return what discriminators say in the end: of demonstrations, unseen ones, the policy's."""
-    found: dict[tuple[Made, str], str] = {}
+    rows: list[Row] = []
     for key, methods in by_method().items():
+        found: Row = {}
         for method, runs in methods.items():
             said = [r["results"]["discriminator"] for r in runs if "discriminator" in r["results"]]
             if said and "agile" not in method:  # which spares what of the policy's it likes best
@@ -214,15 +215,10 @@ def discriminator_rows() -> list[Row]:
                     fmean(of[who] for of in said) for who in ("demonstrated", "unseen", "policy")
                 )
                 seeds = f"; {len(said)} seeds" if len(said) > 1 else ""
-                found[key, method] = ", ".join(f"{100 * mean:.0f}%" for mean in means) + seeds
-    columns = list(dict.fromkeys(key for key, _ in found))
-    return [
-        {
-            "method": f"`{method}`",
-            **{title_of(*key): found.get((key, method), "") for key in columns},
-        }
-        for method in dict.fromkeys(method for _, method in found)
-    ]
+                found[f"`{method}`"] = ", ".join(f"{100 * mean:.0f}%" for mean in means) + seeds
+        if found:
+            rows.append({"demonstrations": title_of(*key), **found})
+    return rows
 
 
 def trial_rows() -> list[Row]:

@@ -43,7 +43,8 @@ def record(options: Options) -> dict:
             print(f"note: {n} of {len(every)} recorded demonstrations: demonstrations.n takes more")
         compare_colours(world, demos.first_frames()[:SHOWN], options.seed)
     else:
-        match world.demonstrate(n, seed=options.seed, progress=options.progress):
+        made: Any = world.demonstrate(n, seed=options.seed, progress=options.progress)
+        match made:
             case (Demonstrations() as demos, truth):
                 pass
             case other:
