@@ -44,14 +44,12 @@ def record(options: Options) -> dict:
         compare_colours(world, demos.first_frames()[:SHOWN], options.seed)
     else:
         made: Any = world.demonstrate(n, seed=options.seed, progress=options.progress)
-        match made:
-            case (Demonstrations() as demos, truth):
-                pass
-            case other:
-                raise UserError(
-                    f"{type(world).__name__}.demonstrate returned {type(other).__name__}: let it "
-                    "return Demonstrations and their Truth, or None in its place"
-                )
+        if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[0], Demonstrations)):
+            raise UserError(
+                f"{type(world).__name__}.demonstrate returned {type(made).__name__}: let it return "
+                "Demonstrations and their Truth, or None in its place"
+            )
+        demos, truth = made
     world.vocabulary = world.vocabulary or demos.vocabulary
     if demos.image_shape != (shown := world.image_shape("simulator", seed=options.seed)):
         raise UserError(
