@@ -7,6 +7,7 @@ import pytest
 from ifo_grounding import networks
 from ifo_grounding.baselines import AGILE
 from ifo_grounding.baselines.config import METHODS
+from ifo_grounding.cli import main
 from ifo_grounding.config import STAGES
 from ifo_grounding.errors import UserError
 from ifo_grounding.files import read_json
@@ -150,3 +151,11 @@ def test_a_rival_runs_on_a_gpu(method, options):
     with pretended_gpu():
         found = baseline(options(*FEWER, *few, f"method={method}", "device=cuda", run="gpu"))
     assert found[method]["rate"]["count"] == 20
+
+
+def test_the_result_of_a_rival_is_not_that_of_the_run(practised, tmp_path, recipes):
+    run = shutil.copytree(practised, tmp_path / "run")
+    main(["run", "baselines", f"run={run}", "method=random", f"results={tmp_path / 'results'}"])
+    kept = read_json(run / "result-random.json")["results"]
+    assert kept["random"]["rate"]["count"] == 20
+    assert not (run / "result.json").exists()  # of which a model card tells
