@@ -179,7 +179,7 @@ def baseline_rows(few: bool) -> list[Row]:
             for key, methods in found.items()
         }
         for method, used in USES.items()
-        if any(method in methods for methods in found.values())
+        if (few or method not in UNLEARNED) and any(method in of for of in found.values())
     ]
 
 
@@ -207,6 +207,8 @@ def discriminator_rows() -> list[Row]:
     """Return what discriminators say in the end: of demonstrations, unseen ones, the policy's."""
     rows: list[Row] = []
     for key, methods in by_method().items():
+        if key[1] > 2000 or key[2:] != ("strong", ""):
+            continue
         found: Row = {}
         for method, runs in methods.items():
             said = [r["results"]["discriminator"] for r in runs if "discriminator" in r["results"]]
@@ -242,18 +244,21 @@ def trial_rows() -> list[Row]:
 
 
 def ahead_rows() -> list[Row]:
-    """Return how far ours is ahead of the best rival after few, and of which not; p by Holm."""
+    """Return how far ours is ahead of the best rival, and of which not; p by Holm.
+
+    After more than few, where imitation mostly leaves nothing to gain, only where ahead of all.
+    """
     rows, of_tasks = [], dict[str, list[Runs]]()
     for key, found in by_method().items():
-        if key[1:] != FEW:  # with more, imitation alone leaves nothing to gain
-            continue
         rivals = {m: runs for m, runs in found.items() if m not in ("ours", "random")}
         both = {m: with_ours(runs, found.get("ours", [])) for m, runs in rivals.items()}
         both = {method: runs for method, runs in both.items() if runs}
-        if both:
-            rows.append(ahead_row(title_of(*key) + more_seeds(*found.values()), both))
-        for method, runs in both.items():
-            of_tasks.setdefault(method, []).append(runs)
+        row = ahead_row(title_of(*key) + more_seeds(*found.values()), both) if both else {}
+        if row and (key[1:] == FEW or row["not ahead of"] == "none"):
+            rows.append(row)
+        if key[1:] == FEW:
+            for method, runs in both.items():
+                of_tasks.setdefault(method, []).append(runs)
     of_all = {m: [*chain(*of)] for m, of in of_tasks.items() if len(of) == len(TASKS)}
     return [*rows, ahead_row("all five tasks, 200", of_all)]
 
