@@ -8,6 +8,8 @@ from typing import Any
 
 import make_speed
 import make_tables
+import numpy as np
+import torch
 from make_tables import TABLE_2, pieces
 from omegaconf import OmegaConf
 from pages import (
@@ -28,7 +30,7 @@ from pages import (
 
 from ifo_grounding.baselines.config import UNLEARNED
 from ifo_grounding.report import figure_png, markdown_table, rates_by_number, training_curves
-from ifo_grounding.report.results import brief
+from ifo_grounding.report.results import brief, by_scene, unpacked
 from ifo_grounding.report.theme import PALETTE, add_legend
 from ifo_grounding.stats import Rate, holm
 from ifo_grounding.tasks import TASKS
@@ -259,8 +261,20 @@ def ahead_rows() -> list[Row]:
         if key[1:] == FEW:
             for method, runs in both.items():
                 of_tasks.setdefault(method, []).append(runs)
-    of_all = {m: [*chain(*of)] for m, of in of_tasks.items() if len(of) == len(TASKS)}
+    of_all = {m: side_by_side(of, m) for m, of in of_tasks.items() if len(of) == len(TASKS)}
     return [*rows, ahead_row("all five tasks, 200", of_all)]
+
+
+def side_by_side(tasks: list[Runs], method: str) -> Runs:
+    """Return a run of each seed with the scenes of all tasks: tasks are given, seeds are drawn."""
+    seen = {
+        name: torch.from_numpy(np.concatenate([unpacked(runs, name) for runs in tasks], 1))
+        for name in (method, "ours")
+    }
+    return [
+        {"results": {name: by_scene(scenes[seed]) for name, scenes in seen.items()}}
+        for seed in range(len(tasks[0]))
+    ]
 
 
 def ahead_row(title: str, both: dict[str, Runs]) -> Row:
