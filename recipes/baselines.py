@@ -89,6 +89,8 @@ ADVERSARIES: dict[str, type[Adversary]] = {
 
 def baseline(options: Options) -> dict[str, Any]:
     """Train a method, if it is not yet, and measure it on the evaluation scenes."""
+    if options.method == "lc-rl" and options.task not in PLANNED:
+        raise UserError(f"lc-rl plans the arm's cells: task={' or task='.join(PLANNED)}")
     for name, make in stages_of(options).items():
         if STAGES.index(name) <= STAGES.index(METHODS[options.method]):
             make(options)
@@ -148,9 +150,8 @@ def trained(options: Options) -> Any:
         imitate_truth(options)
     run = open_run(options)
     if method in ADVERSARIES or method == "bco-alpha":
-        stage = trained_by(options)
-        if stage.result is None:
-            train = bco_alpha if method == "bco-alpha" else adversarial
+        train = bco_alpha if method == "bco-alpha" else adversarial
+        if (stage := trained_by(options)).result is None:
             train(options, stage)
     made_by = () if method in MADE else ("baselines", f"baseline_{method}")
     return load_network(run, file_of(method), options, made_by)
@@ -191,15 +192,13 @@ def bco_alpha(options: Options, stage: Stage) -> None:
     _, report = label_demonstrations(demos, inverse, progress=options.progress)
     changed = float((report.actions != load_labels(run)).float().mean())
     seen, held_out = split_transitions(demos, report.actions, options.imitate.held_out)
-    found = {"of": plain(options.baseline), "labels_changed": changed}
+    found = {"of": options.baseline.read_by("bco-alpha"), "labels_changed": changed}
     imitate_transitions(options, stage, seen, held_out, file_of("bco-alpha"), **found)
 
 
 def planned(options: Options) -> LCRL:
     """Return LC-RL with the reward that it learned, learned now if it has to be."""
     stage, world = trained_by(options), world_of(options)
-    if options.task not in PLANNED:
-        raise UserError(f"lc-rl plans the arm's cells: task={' or task='.join(PLANNED)}")
     run, demos = stage.run, load_demonstrations(stage.run)
     env = world.steppable(ROWS, seed=options.seed)
     truth = true_actions(run)
@@ -210,7 +209,7 @@ def planned(options: Options) -> LCRL:
     if stage.result is None:
         found = planner.learn(options.baseline.likelihood_steps, ROWS, options.seed)
         save_network(run, file, planner.network)
-        finish(options, stage, {"of": plain(options.baseline), **found})
+        finish(options, stage, {"of": options.baseline.read_by("lc-rl"), **found})
     trained = load_network(run, file, options, ("baselines", stage.name))
     planner.network.load_state_dict(trained.state_dict())
     return planner
@@ -218,15 +217,16 @@ def planned(options: Options) -> LCRL:
 
 def trained_by(options: Options) -> Stage:
     """Return the stage that trains a method; one that was begun otherwise is refused."""
-    stage, section = open_stage(options, f"baseline_{options.method}"), plain(options.baseline)
+    method, section = options.method, options.baseline.read_by(options.method)
+    stage = open_stage(options, f"baseline_{method}")
     begun, made = stage.checkpoint.with_name("begun.json"), section
     if stage.result is not None:
         made = stage.result["of"]
     elif begun.exists() and any(begun.parent.glob("*.pt")):
         made = read_json(begun, dict)
-    if made != section:
+    if any(made[name] != wanted for name, wanted in section.items()):
         raise UserError(
-            f"{options.method} was trained in the run {options.run} with {made}: give another run="
+            f"{method} was trained in the run {options.run} with {made}: give another run="
         )
     if stage.result is None:
         write_json(begun, section)
@@ -253,6 +253,7 @@ def adversarial(options: Options, stage: Stage) -> None:
         gamma=practice.gamma,
         stop_action=world.stop_action,
         shapes=policy.network_config.shapes,
+        prior=options.instruction.prior,
         seed=options.seed,
         device=options.device,
         **more,
@@ -294,18 +295,17 @@ def adversarial(options: Options, stage: Stage) -> None:
         acted = adversary.access is ActionDemonstrations
         shown = ActionDemonstrations(unseen, truth) if acted else unseen
         said["unseen"] = adversary.probability(shown)
-    found = {"of": plain(section), **history[-1], "discriminator": said}
+    found = {"of": section.read_by(method), **history[-1], "discriminator": said}
     finish(options, stage, found, history)
 
 
 def access(options: Options, run: Run, worlds: int) -> Any:
     """Return what a method may use of the demonstrations, steps in so many worlds at once."""
-    demos, world = load_demonstrations(run), world_of(options)
-    kind = ADVERSARIES[options.method].access
+    demos, kind = load_demonstrations(run), ADVERSARIES[options.method].access
     if kind is ActionDemonstrations:
         return ActionDemonstrations(demos, true_actions(run))
     if kind is SteppableDemonstrations:
-        env = world.steppable(worlds, seed=options.seed, device=options.device)
+        env = world_of(options).steppable(worlds, seed=options.seed, device=options.device)
         return SteppableDemonstrations(demos, env)
     return demos
 

@@ -1,7 +1,7 @@
 """Rivals as in the paper's Table 1, each with exactly the access it is allowed.
 
-Nothing of the method itself imports this package: a learner of observation-only demonstrations
-neither reads their actions nor steps from their states.
+No learner of the method itself imports this package: of observation-only demonstrations it neither
+reads actions nor steps from their states.
 """
 
 from ifo_grounding.baselines.access import (

@@ -97,9 +97,7 @@ class DiscriminatorLoss(SupervisedLoss):
         loss = (F.softplus(-right).mean() + negative) / 2
         return TensorDict({"loss_discriminator": loss, **found})
 
-    def adversarial(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
-        """Compute it as :class:`~ifo_grounding.training.AdversarialUpdates` asks for it."""
-        return self.forward(demonstrations, policy)
+    adversarial = forward  # as AdversarialUpdates asks for it
 
     def _logits(self, batch: TensorDictBase) -> Tensor:
         if not len(batch):

@@ -23,6 +23,8 @@ METHODS = {
 """Methods of Table 1 and references, and the last stage of a run that each begins with."""
 UNLEARNED = ("random", "expert")
 """Those that learn nothing, so that every seed does the same in the same scenes."""
+READS = {"bco-alpha": ("alpha",), "lc-rl": ("likelihood_steps",)}
+"""Options that a method reads; the others with options learn from a discriminator."""
 PLANNED = ("move", "move-udlr")
 """The tasks of ``lc-rl``, whose plans are of the arm's cells."""
 
@@ -42,6 +44,10 @@ class BaselineConfig:
     model learns on."""
     likelihood_steps: int = 300
     """Of ``lc-rl``: gradient steps of the reward."""
+
+    def read_by(self, method: str) -> dict[str, float | None]:
+        """Return the options that a method reads."""
+        return {name: getattr(self, name) for name in READS.get(method, ("frames", "steps", "lr"))}
 
     def __post_init__(self) -> None:
         check_numbers(self)
