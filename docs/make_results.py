@@ -238,6 +238,8 @@ def trial_rows() -> list[Row]:
         section, name = option.split(".")
         shares = {r[0]["options"][section][name]: rate(r, method).rate for r in trials}
         best = max(shares.values())
+        if best == min(shares.values()):  # of bco-alpha, whose labels stay
+            continue
         shown = {value: f"{value:g}: {percent([shares[value]])}" for value in values}
         texts = (f"**{text}**" if shares[value] == best else text for value, text in shown.items())
         row = rows.setdefault(method, {"method": f"`{method}`", "option": f"`{option}`"})
