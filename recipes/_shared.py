@@ -108,11 +108,11 @@ def refuse_missing(run: Run, options: Options, stage: str) -> None:
     if missing := [name for name in before if not run.record(name)]:
         given = [text for text in sys.argv[1:] if "=" in text and not text.startswith("until=")]
         beside = (path.name for path in run.folder.parent.glob("*"))
-        hint = "" if run.folder.exists() else did_you_mean(run.folder.name, beside)
-        raise UserError(
-            f"{stage} needs {', '.join(missing)} of the run {run.name}{hint} first: "
-            f"ifo-grounding demo {shlex.join(given or [f'run={run.name}'])} until={missing[-1]}"
-        )
+        said = f"there is no run {run.name}{did_you_mean(run.folder.name, beside)}"
+        if run.folder.exists():
+            said = f"{stage} needs {', '.join(missing)} of the run {run.name} first"
+        makes = f"{shlex.join(given or [f'run={run.name}'])} until={missing[-1]}"
+        raise UserError(f"{said}: ifo-grounding demo {makes}")
 
 
 def open_stage(options: Options, name: str, of: Any = None) -> Stage:

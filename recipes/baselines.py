@@ -65,8 +65,10 @@ from ifo_grounding.evaluation import success_rate
 from ifo_grounding.files import read_json, write_json
 from ifo_grounding.networks import make_value
 from ifo_grounding.objectives import InverseLoss
-from ifo_grounding.report.results import by_scene
+from ifo_grounding.report.results import by_scene, restored
+from ifo_grounding.stats import Rate
 from ifo_grounding.training import Run, Stage, fit, improve_policy
+from ifo_grounding.training.checkpoint import difference
 
 ENTROPY = 0.01
 """Weight of the entropy bonus of a policy that learns from a discriminator."""
@@ -224,10 +226,9 @@ def trained_by(options: Options) -> Stage:
         made = stage.result["of"]
     elif begun.exists() and any(begun.parent.glob("*.pt")):
         made = read_json(begun, dict)
-    if any(made[name] != wanted for name, wanted in section.items()):
-        raise UserError(
-            f"{method} was trained in the run {options.run} with {made}: give another run="
-        )
+    made = {name: made[name] for name in section}
+    if change := difference({"baseline": made}, {"baseline": section}):
+        raise UserError(f"{method} was {change}, or give base={options.run} and another run=")
     if stage.result is None:
         write_json(begun, section)
     return stage
@@ -319,10 +320,9 @@ def validation_success(policy: Any, options: Options) -> Any:
 @recipe_main
 def main(options: Options) -> dict:
     results = baseline(options)
-    if options.results:
-        named = replace(options, variant="-".join(filter(None, [options.variant, options.method])))
-        write_result(named, results, "run baselines", f"result-{options.method}.json")
-    tell({options.method: results[options.method].get("rate", results[options.method])})
+    named = replace(options, variant="-".join(filter(None, [options.variant, options.method])))
+    write_result(named, results, "run baselines", f"result-{options.method}.json")
+    tell({options.method: restored(Rate, results[options.method]["rate"])})
     return results
 
 

@@ -65,7 +65,7 @@ class PlayOptions:
         check_range(self, "scene", "seed", least=0, most=2**31)
         check_range(self, "port", least=1, most=65_535)
         if self.to is not None and Path(self.to).suffix.lower() != ".gif":
-            raise UserError(f"to={self.to} is a GIF: give it a name that ends in .gif")
+            raise UserError(f"to= names a GIF, not {self.to}: give it a name that ends in .gif")
         if self.to is None and (self.sentence is not None or self.scene or self.seed):
             raise UserError("scene, sentence and seed are for one animation: give to=play.gif, too")
 

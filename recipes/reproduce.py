@@ -78,7 +78,7 @@ class ReproduceOptions:
     progress: bool = True
     """Whether to show a progress bar."""
     all: dict[str, Any] = field(default_factory=dict)
-    """Options of all pieces of tables and figures."""
+    """Options of all pieces of tables 2 to 4 and of figures."""
     preset: dict[str, Any] = field(default_factory=dict)
     """Further ones by preset."""
     preset_of_task: dict[str, Any] = field(default_factory=dict)

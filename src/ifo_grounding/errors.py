@@ -31,7 +31,7 @@ def check_choice(name: str, value: object, allowed: Iterable[object]) -> None:
     options = list(allowed)
     if value not in options:
         hint = did_you_mean(str(value), [each for each in options if isinstance(each, str)])
-        listed = ", ".join(repr(option) for option in options)
+        listed = ", ".join(repr(option) for option in options if option is not None)
         raise UserError(f"unknown {name} {value!r}{hint}: choose one of {listed}")
 
 

@@ -137,9 +137,9 @@ def test_the_agent_is_talked_to(opened):
     typed(opened, "move to the yel")
     opened.locator("#completions").get_by_text("move to the yellow circle").wait_for()
     tell(opened, "fly to the purple moon")
-    says(opened, "#status", "it has never heard 'fly', 'moon'")
+    says(opened, "#status", "the policy has never heard 'fly', 'moon'")
     tell(opened, "<img src=x onerror=alert(1)> red")
-    says(opened, "#status", "it has never heard")
+    says(opened, "#status", "the policy has never heard")
     assert opened.locator("#status img").count() == 0
     tell(opened, "")
     says(opened, "#status", "0 words|Say something")

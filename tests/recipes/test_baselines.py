@@ -59,7 +59,7 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
             said = results["discriminator"]
             assert said.keys() == {"demonstrated", "policy", "unseen"}
             assert all(0 < probability < 1 for probability in said.values())
-        with pytest.raises(UserError, match="give another run="):
+        with pytest.raises(UserError, match=r"made with baseline\..* or give base="):
             baseline(options(*FEWER, f"method={method}", OTHERWISE.get(method, "baseline.steps=3")))
         unread = "baseline.steps=3" if method in OTHERWISE else "baseline.alpha=3"
         assert baseline(options(*FEWER, f"method={method}", unread)) == results
@@ -89,9 +89,9 @@ def test_an_interrupted_rival_goes_on_as_it_began_alone(practised, options, tmp_
     with pytest.raises(Killed):
         baselines.baseline(given)
     monkeypatch.undo()
-    for other in ("baseline.lr=0.01", "baseline.steps=2"):
-        with pytest.raises(UserError, match="give another run="):
-            baselines.baseline(options(*FEWER, "method=gail", other))
+    for name, value in ("lr", "0.01"), ("steps", "2"):
+        with pytest.raises(UserError, match=f"{name}=.*, not {value}: leave it out, or give base="):
+            baselines.baseline(options(*FEWER, "method=gail", f"baseline.{name}={value}"))
     assert baselines.baseline(given)["gail"]["rate"]["count"] == 20
 
 

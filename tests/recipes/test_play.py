@@ -54,7 +54,7 @@ def test_the_networks_of_a_run_are_played(played, phase_1):
         (["sentence=''"], "0 words"),
         (["sentence='move to " + 40 * "the " + "red circle'"], "an instruction has 1 to 16"),
         (["run=never-made"], "there is no run never-made"),
-        (["to=x.png"], "is a GIF"),
+        (["to=x.png"], "names a GIF, not x.png"),
         (["scene=-1"], "scene must be at least 0"),
         (["seed=-1"], "seed must be at least 0"),
         (["sentence=<b>move</b>, to: #1 (it's)"], "never heard"),

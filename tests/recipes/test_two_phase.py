@@ -161,17 +161,18 @@ def test_a_stage_without_what_it_needs_says_what_to_run(options, tmp_path, monke
 
     monkeypatch.setattr("sys.argv", ["imitate.py", "run=a b", "until=label"])
     first = "record_demonstrations, collect_transitions, train_inverse, label"
-    with pytest.raises(UserError, match=f"^imitate needs {first} of .* demo 'run=a b' until=label"):
+    with pytest.raises(UserError, match=r"^there is no run .*run: .* demo 'run=a b' until=label"):
         imitate(options())
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "run").mkdir()
     with pytest.raises(UserError, match=f"^evaluate needs {first}, imitate of .* until=imitate"):
         evaluate(options())
     with pytest.raises(UserError, match=r"train_instruction, train_goal of .* until=train_goal"):
         examine(options())
-    assert not (tmp_path / "run").exists()
     (tmp_path / "move-few").mkdir()
     monkeypatch.setenv("IFO_GROUNDING_HOME", str(tmp_path / "home"))
     for run, hint in ("movefew", r" \(did you mean 'move-few'\?\)"), ("another", ""):
-        with pytest.raises(UserError, match=f"imitate of the run .*{run}{hint} first"):
+        with pytest.raises(UserError, match=f"^there is no run .*{run}{hint}: "):
             evaluate(options(run=run))
 
 

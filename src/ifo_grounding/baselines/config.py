@@ -33,7 +33,7 @@ PLANNED = ("move", "move-udlr")
 class BaselineConfig:
     """Rivals of Table 1: ``ifo-grounding run baselines``."""
 
-    frames: int = 2_000_000
+    frames: int = 600_000
     """Steps of the simulator that the policy learns from."""
     steps: int = 10
     """Gradient steps of the discriminator after each iteration."""

@@ -143,7 +143,7 @@ class Agent:
         known = set(self.vocabulary.words)
         words = words_of(sentence, self.vocabulary.punctuation)
         if unknown := list(dict.fromkeys(word for word in words if word not in known)):
-            raise UserError(f"it has never heard {', '.join(map(repr, unknown))}")
+            raise UserError(f"the policy has never heard {', '.join(map(repr, unknown))}")
         return self.vocabulary.encode([sentence])
 
     def complete(self, sentence: str, frame: Tensor, count: int = 8) -> list[str]:

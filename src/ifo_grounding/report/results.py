@@ -130,11 +130,17 @@ def percent(rate: Rate) -> str:
 
 
 def seeds_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
-    """Return means and intervals over runs, each the name of a row and what was measured."""
+    """Return means and intervals over runs, each the name of a row and what was measured.
+
+    These are both phases, where a run has them, or what else was measured scene by scene.
+    """
+    groups: dict[tuple[str, tuple[str, ...]], list[dict[str, Any]]] = {}
+    for name, results in runs:
+        found = [n for n, of in results.items() if isinstance(of, Mapping) and "outcomes" in of]
+        phases = [n for n in ("phase1", "phase2") if n in found]
+        groups.setdefault((name, tuple(phases or found)), []).append({"results": results})
     rows = []
-    for name in dict.fromkeys(name for name, _ in runs):
-        same = [{"results": results} for each, results in runs if each == name]
-        there = [p for p in ("phase1", "phase2") if all(p in run["results"] for run in same)]
+    for (name, there), same in groups.items():
         solved = [unpacked(same, phase) for phase in there]
         row: dict[str, Any] = {"runs": name, "seeds": len(same)}
         row |= {p: brief(rate_over_seeds(s)) for p, s in zip(there, solved, strict=True)}

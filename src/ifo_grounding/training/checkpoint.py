@@ -34,9 +34,12 @@ def difference(
     >>> difference({"imitate": {"steps": 900}}, {"imitate": {"steps": 10}})
     'made with imitate.steps=900, not 10: leave it out'
     >>> difference({"imitate": {"steps": 900}}, {"imitate": {"steps": 10}}, free=["imitate"])
+    >>> difference({"world": {"id": "a", "split": "all"}}, {"world": {"id": "b"}})
+    'made with world.id=a, not b: leave it out'
     """
     before, now = leaves(made), leaves(asked)
-    for name in dict.fromkeys([*before, *now]):
+    both = [name for name in before if name in now]  # what another world lacks says less
+    for name in dict.fromkeys([*both, *before, *now]):
         there, here = before.get(name), now.get(name)
         if there == here or any(f"{name}.".startswith(f"{each}.") for each in free):
             continue
