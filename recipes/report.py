@@ -19,6 +19,7 @@ from _shared import (
 )
 from evaluate import evaluate, played
 
+from ifo_grounding.baselines.config import METHODS
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
 from ifo_grounding.evaluation import record_episodes, trace_episode
@@ -96,7 +97,8 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     pictures |= curves(run)
     section = options.evaluate
     scenes = section.stream if section.split == "all" else f"{section.stream}, {section.split}"
-    rows = [{**row, "means": meaning(row["measured"])} for row in results_rows(results)]
+    rows = [*results_rows(results), *rivals(run)]
+    rows = [{**row, "means": meaning(row["measured"])} for row in rows]
     return write_report(
         run / "report",
         {**headline(results), "All that was measured": rows, "How it was made": made_by(run)},
@@ -105,6 +107,16 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
         summary=f"{conclusion(results)} Preset {options.preset}, seed {options.seed}, "
         f"{section.episodes:,} scenes ({scenes}).",
     )
+
+
+def rivals(run: Run) -> list[dict[str, Any]]:
+    """Return a row for each method of Table 1 that ``run baselines`` measured beside this run."""
+    measured = {method: run.stage(f"evaluate_{method}").result for method in METHODS}
+    rates = {m: of["results"][m]["rate"] for m, of in measured.items() if of}
+    return [
+        {"measured": f"{method} (baseline), success", "result [95% interval]": restored(Rate, rate)}
+        for method, rate in rates.items()
+    ]
 
 
 def made_by(run: Run) -> dict[str, Any]:
