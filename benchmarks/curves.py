@@ -22,7 +22,7 @@ from ifo_grounding.report import provenance
 from ifo_grounding.stats import paired_difference, rate_over_seeds
 from ifo_grounding.training import FitConfig, fit
 
-CONFIG = FitConfig(steps=300, batch_size=256, lr=4e-3, iteration=25, warmup=0.1, weight_decay=0.01)
+CONFIG = FitConfig(steps=300, batch_size=256, lr=4e-3, iteration=25, weight_decay=0.01)
 SEEDS = range(5)
 WAYS = ("cells that look alike once", "each cell by itself")
 

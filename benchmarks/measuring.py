@@ -17,9 +17,6 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 PEERS = ROOT / ".venv-peers"
 
-MEMORY = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": str(2**31 - 1)}
-"""Lets peers keep the memory that they free, as ``keep_freed_memory`` does here."""
-
 Once = Callable[[], tuple[float, float]]
 """Does the work of one repeat: how much was done, and in how many seconds."""
 

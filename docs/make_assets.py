@@ -50,7 +50,7 @@ def before_and_after(run: Run) -> bytes:
     return animation(both, titles=titles, columns=SCENES, width=180)
 
 
-def page_at_work(run: Run, sentence: str = "move to the yellow triangle") -> bytes:
+def page_at_work(run: Run) -> bytes:
     """Type a sentence into the page, and let the agent follow it."""
     from playwright.sync_api import sync_playwright
 
@@ -66,7 +66,7 @@ def page_at_work(run: Run, sentence: str = "move to the yellow triangle") -> byt
             page.goto("http://127.0.0.1:7899")
             page.locator("#completions button").first.wait_for()
             page.locator("#sentence textarea").fill("")
-            for letter in sentence:
+            for letter in "move to the yellow triangle":
                 page.locator("#sentence textarea").press_sequentially(letter)
                 shots.append(page.screenshot())
             page.get_by_role("button", name="Tell", exact=True).click()

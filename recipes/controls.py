@@ -38,7 +38,7 @@ def continue_imitation(options: Options) -> dict:
         )
         best.measure()  # phase 1 itself is the one to beat
         looks = math.ceil(section.iterations / section.select_every)
-        config = replace(config, validate_every=math.ceil(config.steps / config.iteration / looks))
+        best.every = math.ceil(config.steps / config.iteration / looks)
     return learn(options, stage, ImitationLoss(policy), seen, config, CONTINUED, held_out=best)
 
 
@@ -50,10 +50,9 @@ def matched_steps(options: Options) -> int:
     """
     section = options.self_examine
     collected = section.iterations * section.num_envs * section.steps
-    epochs = section.epochs if section.algorithm == "ppo" else 1
-    samples = collected * (2 * epochs + 1 / 3)
+    samples = collected * (2 * section.passes + 1 / 3)
     if section.imitation_weight:
-        samples += collected / section.minibatch * epochs * AuxiliaryImitation.batch_size
+        samples += collected / section.minibatch * section.passes * AuxiliaryImitation.batch_size
     return max(1, round(samples / section.minibatch))
 
 

@@ -50,14 +50,12 @@ def record(options: Options) -> dict:
                 "Demonstrations and their Truth, or None in its place"
             )
         demos, truth = made
-    world.vocabulary = world.vocabulary or demos.vocabulary
-    # What is read has been compared as it was read.
-    shown = demos.image_shape if options.recorded else world.image_shape("simulator", seed=0)
-    if demos.image_shape != shown:
-        raise UserError(
-            f"demonstrations show images of {list(demos.image_shape)}, the simulator of "
-            f"{list(shown)}: let it show the same"
-        )
+        world.vocabulary = world.vocabulary or demos.vocabulary
+        if demos.image_shape != (shown := world.image_shape("simulator", seed=0)):
+            raise UserError(
+                f"demonstrations show images of {list(demos.image_shape)}, the simulator of "
+                f"{list(shown)}: let it show the same"
+            )
     if world.rewarded:
         try_out(world, options.seed)
     if truth is not None:

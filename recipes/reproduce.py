@@ -19,7 +19,7 @@ from tqdm import tqdm
 from ifo_grounding.baselines.config import METHODS, PLANNED, UNLEARNED
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.cluster import Call, run_on_cluster
-from ifo_grounding.errors import UserError, check_choice
+from ifo_grounding.errors import UserError, check_choice, check_range
 from ifo_grounding.files import home
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.training import Run
@@ -103,8 +103,7 @@ class ReproduceOptions:
         for kind, of in (("task", TASKS), ("preset", presets), ("method", METHODS)):
             for name in getattr(self, f"{kind}s"):
                 check_choice(kind, name, of)
-        if self.jobs < 1:
-            raise UserError(f"jobs must be at least 1, got {self.jobs}")
+        check_range(self, "jobs", least=1)
 
 
 ConfigStore.instance().store(name="reproduce_options", node=ReproduceOptions)

@@ -178,7 +178,3 @@ def recipes_folder() -> Path:
 def recipe_names() -> list[str]:
     """Return the names of all recipes, sorted."""
     return sorted(path.stem for path in recipes_folder().glob("[!_]*.py"))
-
-
-if __name__ == "__main__":
-    main()

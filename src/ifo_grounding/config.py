@@ -19,7 +19,6 @@ from ifo_grounding.files import check_folder
 from ifo_grounding.machine import check_device
 from ifo_grounding.networks.config import NetworksConfig
 from ifo_grounding.objectives.instruction import UNLABELLED
-from ifo_grounding.seeding import STREAMS
 from ifo_grounding.tasks.grammar import SPLITS
 from ifo_grounding.training.run import LOGGERS
 from ifo_grounding.training.self_examination import SelfExaminationConfig
@@ -152,11 +151,8 @@ class RewardConfig(FitConfig):
 
 
 @dataclass
-class GoalConfig(FitConfig):
+class GoalConfig(RewardConfig):
     """The goal classifier (an extension)."""
-
-    warm_start: bool = True
-    """Begin with the weights of the phase-1 policy."""
 
 
 @dataclass
@@ -218,7 +214,7 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         check_choice("mode", self.mode, (*MODES, "both"))
-        check_choice("stream", self.stream, STREAMS)
+        check_choice("stream", self.stream, ("validation", "evaluation"))
         check_choice("split", self.split, SPLITS)
         check_range(self, "episodes", "audit_episodes", "max_steps", least=1)
         check_range(self, "states", "seed", least=0)

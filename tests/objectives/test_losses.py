@@ -210,7 +210,7 @@ def test_reward_loss_by_hand(given):
 def test_adversarial_reward_loss_by_hand():
     loss = RewardLoss(scores([[logit(0.8), logit(0.3)]] * 2), n_actions=2)
     demonstrations = labelled([0, 1])
-    out = loss.adversarial(demonstrations, demonstrations[:1], smoothing=0.1)
+    out = loss.adversarial(demonstrations, demonstrations[:1])
     positives = -(0.9 * math.log(0.8) + 0.1 * math.log(0.2) + 0.9 * math.log(0.3)) / 2
     positives -= 0.1 * math.log(0.7) / 2
     negatives = -(0.1 * math.log(0.8) + 0.9 * math.log(0.2))

@@ -13,12 +13,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ifo_grounding.channels import channels_last
+from ifo_grounding.data._spool import PIECE_BYTES
 from ifo_grounding.errors import UserError, at_least_one, check_below, optional
 from ifo_grounding.files import regular_file
 from ifo_grounding.tasks.vocabulary import MOST_WORDS, Vocabulary, check_vocabulary, words_of
 
 PIECE_FRAMES = 512
-PIECE_BYTES = 16 << 20
 MOST_FRAMES = 100_000
 MOST_BYTES = 1 << 30
 """What an episode may hold in a file: small files can claim a lot."""

@@ -16,14 +16,14 @@ from ifo_grounding.data._images import Source, stack_images
 from ifo_grounding.data._video import read_video
 from ifo_grounding.data.demonstrations import Demonstrations
 from ifo_grounding.data.folder import DAMAGED, vacant
-from ifo_grounding.data.pictures import TRUNCATED, rgb, written_sentences
+from ifo_grounding.data.pictures import FRAMES_PER_SECOND, TRUNCATED, rgb, written_sentences
 from ifo_grounding.errors import UserError, at_least_one, optional
 from ifo_grounding.files import atomic_write, read_json, write_json
 from ifo_grounding.progress import progress_bar
 
 INFO, VERSION = "meta/info.json", "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-CAMERA, FRAMES_PER_SECOND = "observation.image", 4
+CAMERA = "observation.image"
 
 
 def load_lerobot(

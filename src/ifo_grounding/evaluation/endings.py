@@ -101,7 +101,7 @@ def _ending(
 ) -> Tensor:
     """Return how episodes ended, index into ENDINGS [B]."""
     gone_to = _gone_to(last, goal)
-    carried = _carried(first, last, wanted, goal)
+    carried = _carried(first, last, wanted)
     mistaken = torch.where(goal.carries, carried, gone_to)
     untouched = goal.carries & (last.objects == first.objects).all(-1) & (last.held == 0)
     kind = torch.where(mistaken > 0, WRONG_OBJECT, WRONG_PLACE)
@@ -119,7 +119,7 @@ def _gone_to(last: WorldState, goal: Goal) -> Tensor:
     return torch.where(inside | ~goal.has_side, found, 0)
 
 
-def _carried(first: WorldState, last: WorldState, wanted: Plan, goal: Goal) -> Tensor:
+def _carried(first: WorldState, last: WorldState, wanted: Plan) -> Tensor:
     """Return the kind of an object, other than the one to be carried, that was moved; else 0."""
     others = first.objects.scatter(-1, wanted.object_cell.unsqueeze(-1), 0)
     gone = (others > 0) & (last.objects != others)

@@ -12,6 +12,9 @@ from ifo_grounding import keys
 from ifo_grounding.errors import UserError, at_least_one
 from ifo_grounding.objectives.base import ActionKeys, SupervisedLoss, check_action
 
+SMOOTHING = 0.1
+"""How far targets are from 1 and 0 during self-examination, for the policy is often right."""
+
 
 class RewardLoss(SupervisedLoss):
     """Binary cross entropy of right actions against wrong ones (2nd phase of the paper).
@@ -62,22 +65,19 @@ class RewardLoss(SupervisedLoss):
             right, wrong = self._scores(tensordict, both).unbind(-1)
         return self._losses(right, wrong, tensordict, tensordict)
 
-    def adversarial(
-        self, demonstrations: TensorDictBase, policy: TensorDictBase, smoothing: float = 0.1
-    ) -> TensorDict:
+    def adversarial(self, demonstrations: TensorDictBase, policy: TensorDictBase) -> TensorDict:
         """Compute the loss of labelled actions against the policy's own (self-examination).
 
         Args:
             demonstrations: transitions with labelled actions, as for :meth:`forward`.
             policy: transitions with the policy's actions, of any batch size.
-            smoothing: how far the targets are from 1 and 0, for the policy is often right.
         """
         self._require(demonstrations)
         self._require(policy)
         with self._mode():
             right = self._scores(demonstrations, self._actions(demonstrations)).squeeze(-1)
             wrong = self._scores(policy, self._actions(policy)).squeeze(-1)
-        return self._losses(right, wrong, demonstrations, policy, smoothing)
+        return self._losses(right, wrong, demonstrations, policy, SMOOTHING)
 
     def _losses(
         self,

@@ -231,7 +231,7 @@ class Agent:
                 assert tokens is not None
                 (episode,) = record_episodes(told(policy, tokens), self._env, [scene], **how)
                 episode = replace(episode, sentence=self.vocabulary.decode(tokens)[0])
-            states = self._retrace(scene, seed, episode.actions, state)
+            states = self._retrace(scene, episode.actions, state)
             networks = {} if self.goal is None else {"goal": self.goal}
             trace = trace_episode(policy, episode, networks, vocabulary=self.vocabulary)
         tokens = self.vocabulary.encode([episode.sentence])
@@ -257,9 +257,7 @@ class Agent:
             return False
         return True
 
-    def _retrace(
-        self, scene: int, seed: int, actions: Any, state: WorldState | None
-    ) -> list[WorldState]:
+    def _retrace(self, scene: int, actions: Any, state: WorldState | None) -> list[WorldState]:
         """Return the worlds of an episode, for drawing: the policy's actions tell them all."""
         if not self.arranges:
             return []

@@ -97,9 +97,8 @@ class Learner:
         set_rates(self.optimizer, policy_lr, scale * config.value_lr)
         # What comes next is in the advantage already; copying its images would cost a tenth.
         steps = batch.exclude(keys.NEXT, keys.INITIAL_PIXELS).reshape(-1)
-        epochs = config.epochs if config.algorithm == "ppo" else 1
         updates = []
-        for _ in range(epochs):
+        for _ in range(config.passes):
             for rows in torch.randperm(len(steps), device=steps.device).split(config.minibatch):
                 parts = TensorDict({"collected": steps[rows]}, device=steps.device)
                 if self.imitation:

@@ -31,6 +31,9 @@ AT_ONCE = 1024
 class BestWeights:
     """The weights of a module that did best so far, by whatever a subclass measures."""
 
+    every = 4
+    """Iterations of :func:`~ifo_grounding.training.fit` between two measures."""
+
     def __init__(self, module: nn.Module) -> None:
         self.module = module
         self.best: Tensor | None = None

@@ -77,6 +77,11 @@ class SelfExaminationConfig:
     evaluate_every: int = 0
     """Iterations between two calls of the callback; 0 calls it at the end only."""
 
+    @property
+    def passes(self) -> int:
+        """Passes over the collected steps."""
+        return self.epochs if self.algorithm == "ppo" else 1
+
     def __post_init__(self) -> None:
         check_numbers(self, unbounded=["grad_clip", "select_margin"])
         check_choice("algorithm", self.algorithm, ALGORITHMS)

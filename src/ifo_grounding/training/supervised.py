@@ -30,6 +30,10 @@ from ifo_grounding.training.updates import (
 )
 
 SCHEDULES = ("constant", "cosine")
+WARMUP = 0.1
+"""Share of the steps that warm up, with the schedule ``cosine``."""
+GRAD_CLIP = 1.0
+"""Largest norm of the gradient."""
 
 
 @dataclass
@@ -44,8 +48,6 @@ class FitConfig:
     """Peak learning rate (paper: 8e-4)."""
     schedule: str = "cosine"
     """``constant``, or ``cosine``: a short warm-up, then down to zero."""
-    warmup: float = 0.1
-    """Share of the steps that warm up, with ``cosine``."""
     weight_decay: float = 0.0
     """Decoupled weight decay; 0 makes AdamW the paper's Adam. Weights decay to zero, or where they
     are another network's (``init_from``) to what they were there (L2-SP, Li et al. 2018), so that
@@ -53,26 +55,21 @@ class FitConfig:
     prior: float = 0.0
     """Weight decay is this over the number of samples, where that is more than ``weight_decay``: a
     Gaussian prior on weights, which counts more the fewer samples there are."""
-    grad_clip: float = 1.0
-    """Largest norm of the gradient."""
     iteration: int = 50
     """Steps between two points where a killed run can continue."""
-    validate_every: int = 4
-    """Iterations between two measures of ``held_out``, where there is one."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, unbounded=["grad_clip"])
+        check_numbers(self)
         check_choice("schedule", self.schedule, SCHEDULES)
-        check_range(self, "steps", "batch_size", "iteration", "validate_every", least=1)
-        check_range(self, "lr", "grad_clip", above=0)
+        check_range(self, "steps", "batch_size", "iteration", least=1)
+        check_range(self, "lr", above=0)
         check_range(self, "weight_decay", "prior", least=0)
-        check_range(self, "warmup", least=0, most=1)
 
     def rate(self, step: int) -> float:
         """Return the share of the peak learning rate at a step."""
         if self.schedule == "constant":
             return 1.0
-        warmup = max(1, round(self.warmup * self.steps))
+        warmup = max(1, round(WARMUP * self.steps))
         if step < warmup:
             return (step + 1) / warmup
         return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, self.steps - warmup)))
@@ -156,7 +153,7 @@ def fit(
     shared = averaging(loss)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
-        return update(shared(batch), optimizer, config.grad_clip)
+        return update(shared(batch), optimizer, GRAD_CLIP)
 
     make_step = prepared(step, optimizer, cudagraph and same_steps and processes() == 1)
     for iteration in loop:
@@ -175,7 +172,7 @@ def fit(
         metrics = {"step": float(steps.stop), **found, "samples_per_second": speed}
         done = iteration + 1
         if held_out:
-            if done % config.validate_every == 0 or done == iterations:
+            if done % held_out.every == 0 or done == iterations:
                 metrics |= held_out.measure()
             if done == iterations:
                 held_out.restore()
