@@ -9,7 +9,6 @@ from typing import Any
 import make_speed
 import make_tables
 import numpy as np
-import torch
 from make_tables import TABLE_2, pieces
 from omegaconf import OmegaConf
 from pages import (
@@ -30,9 +29,9 @@ from pages import (
 
 from ifo_grounding.baselines.config import UNLEARNED
 from ifo_grounding.report import figure_png, markdown_table, rates_by_number, training_curves
-from ifo_grounding.report.results import brief, by_scene, unpacked
+from ifo_grounding.report.results import brief, unpacked
 from ifo_grounding.report.theme import PALETTE, add_legend
-from ifo_grounding.stats import Rate, holm
+from ifo_grounding.stats import Difference, Rate, holm, paired_difference
 from ifo_grounding.tasks import TASKS
 
 LEVELS = ("GoToObj", "GoToLocal", "PickupLoc")
@@ -257,31 +256,27 @@ def ahead_rows() -> list[Row]:
         rivals = {m: runs for m, runs in found.items() if m not in ("ours", "random")}
         both = {m: with_ours(runs, found.get("ours", [])) for m, runs in rivals.items()}
         both = {method: runs for method, runs in both.items() if runs}
-        row = ahead_row(title_of(*key) + more_seeds(*found.values()), both) if both else {}
+        behind = {method: difference(runs, method, "ours") for method, runs in both.items()}
+        row = ahead_row(title_of(*key) + more_seeds(*found.values()), behind) if both else {}
         if row and (key[1:] == FEW or row["not ahead of"] == "none"):
             rows.append(row)
         if key[1:] == FEW:
             for method, runs in both.items():
                 of_tasks.setdefault(method, []).append(runs)
-    of_all = {m: side_by_side(of, m) for m, of in of_tasks.items() if len(of) == len(TASKS)}
+    of_all = {m: over_tasks(of, m) for m, of in of_tasks.items() if len(of) == len(TASKS)}
     return [*rows, ahead_row("all five tasks, 200", of_all)]
 
 
-def side_by_side(tasks: list[Runs], method: str) -> Runs:
-    """Return a run of each seed with the scenes of all tasks: tasks are given, seeds are drawn."""
-    seen = {
-        name: torch.from_numpy(np.concatenate([unpacked(runs, name) for runs in tasks], 1))
-        for name in (method, "ours")
-    }
-    return [
-        {"results": {name: by_scene(scenes[seed]) for name, scenes in seen.items()}}
-        for seed in range(len(tasks[0]))
-    ]
+def over_tasks(tasks: list[Runs], method: str) -> Difference:
+    """Return how far ours is ahead in the scenes of all tasks, which are given: seeds are drawn."""
+    before, after = (
+        np.concatenate([unpacked(runs, name) for runs in tasks], 1) for name in (method, "ours")
+    )
+    return paired_difference(before, after)
 
 
-def ahead_row(title: str, both: dict[str, Runs]) -> Row:
-    """Return how far ours is ahead, from runs of each rival with ours beside it."""
-    behind = {m: difference(runs, m, "ours") for m, runs in both.items()}
+def ahead_row(title: str, behind: dict[str, Difference]) -> Row:
+    """Return how far ours is ahead of the best of some rivals, and of which not."""
     p = dict(zip(behind, holm([each.p_value for each in behind.values()]), strict=True))
     best = min(behind, key=lambda m: behind[m].points)
     return {

@@ -56,7 +56,7 @@ from ifo_grounding.baselines import (
     SteppableDemonstrations,
     steps_of_policy,
 )
-from ifo_grounding.baselines.config import METHODS, PLANNED
+from ifo_grounding.baselines.config import METHODS, PLANNED, REFERENCES
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import STAGES, Options
 from ifo_grounding.data import Collected, label_demonstrations
@@ -161,9 +161,9 @@ def trained(options: Options) -> Any:
 
 def references(options: Options) -> dict[str, Any]:
     """Return what phase 1 is compared with: imitation of true actions, and the demonstrator."""
-    methods = {"true_actions": "bc", "demonstrator": "expert"}
     return {
-        name: baseline(replace(options, method=method))[method] for name, method in methods.items()
+        name: baseline(replace(options, method=method))[method]
+        for name, method in REFERENCES.items()
     }
 
 

@@ -19,7 +19,7 @@ from _shared import (
 )
 from evaluate import evaluate, played
 
-from ifo_grounding.baselines.config import METHODS
+from ifo_grounding.baselines.config import METHODS, REFERENCES
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.config import Options
 from ifo_grounding.evaluation import record_episodes, trace_episode
@@ -97,7 +97,7 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     pictures |= curves(run)
     section = options.evaluate
     scenes = section.stream if section.split == "all" else f"{section.stream}, {section.split}"
-    rows = [*results_rows(results), *rivals(run)]
+    rows = [*results_rows(results), *rivals(run, results)]
     rows = [{**row, "means": meaning(row["measured"])} for row in rows]
     return write_report(
         run / "report",
@@ -109,9 +109,11 @@ def report(options: Options, results: dict[str, Any] | None = None) -> Path:
     )
 
 
-def rivals(run: Run) -> list[dict[str, Any]]:
-    """Return a row for each method of Table 1 that ``run baselines`` measured beside this run."""
-    measured = {method: run.stage(f"evaluate_{method}").result for method in METHODS}
+def rivals(run: Run, results: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return a row for each method of Table 1 that was measured, and is not among the results."""
+    shown = [method for name, method in REFERENCES.items() if name in results]
+    others = [method for method in METHODS if method not in shown]
+    measured = {method: run.stage(f"evaluate_{method}").result for method in others}
     rates = {m: of["results"][m]["rate"] for m, of in measured.items() if of}
     return [
         {"measured": f"{method} (baseline), success", "result [95% interval]": restored(Rate, rate)}

@@ -43,9 +43,11 @@ def test_a_method_is_trained_and_measured(method, practised, options, tmp_path):
     run = shutil.copytree(practised, tmp_path / "run")
     given = options(*FEWER, f"method={method}")
     results = baseline(given)
-    (row,) = rivals(Run(run))
+    (row,) = rivals(Run(run), {})
     assert row["measured"] == f"{method} (baseline), success"
     assert row["result [95% interval]"].as_dict() == results[method]["rate"]
+    beside = rivals(Run(run), {"true_actions": results, "demonstrator": results})
+    assert beside == ([] if method in ("bc", "expert") else [row])  # which stand there already
     assert 0 <= results[method]["rate"]["rate"] <= 1 and results[method]["rate"]["count"] == 20
     if method == "ours":
         assert [frames for frames, _ in results["curve"]] == [80, 160]

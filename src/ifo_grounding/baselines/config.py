@@ -21,6 +21,8 @@ METHODS = {
     "expert": "record_demonstrations",
 }
 """Methods of Table 1 and references, and the last stage of a run that each begins with."""
+REFERENCES = {"true_actions": "bc", "demonstrator": "expert"}
+"""Methods that ``references=true`` measures beside both phases, by their names in the results."""
 UNLEARNED = ("random", "expert")
 """Those that learn nothing, so that every seed does the same in the same scenes."""
 READS = {"bco-alpha": ("alpha",), "lc-rl": ("likelihood_steps",)}

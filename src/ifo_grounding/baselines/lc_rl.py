@@ -175,7 +175,7 @@ class LCRL:
             row = torch.searchsorted(index, episode[of_these])
             told = chosen[row, cells[of_these], self.choice[of_these]]
             losses = TensorDict({"loss_likelihood": -told.mean()})
-            updates.append(update(losses, self.optimizer, grad_clip=1.0))
+            updates.append(update(losses, self.optimizer))
         self.network.eval()
         return means(updates)
 

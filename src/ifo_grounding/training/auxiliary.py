@@ -84,5 +84,5 @@ class AdversarialUpdates:
             rows = torch.randint(len(policy_steps), (self.batch_size,))
             shown = beside(self.demonstrations.sample(self.batch_size), self.loss)
             losses = self.loss.adversarial(shown, policy_steps[rows])
-            updates.append(update(losses, self.optimizer, grad_clip=1.0))
+            updates.append(update(losses, self.optimizer))
         return {f"reward/{key}": value for key, value in means(updates).items()}

@@ -32,8 +32,6 @@ from ifo_grounding.training.updates import (
 SCHEDULES = ("constant", "cosine")
 WARMUP = 0.1
 """Share of the steps that warm up, with the schedule ``cosine``."""
-GRAD_CLIP = 1.0
-"""Largest norm of the gradient."""
 
 
 @dataclass
@@ -153,7 +151,7 @@ def fit(
     shared = averaging(loss)
 
     def step(batch: TensorDictBase) -> dict[str, Tensor]:
-        return update(shared(batch), optimizer, GRAD_CLIP)
+        return update(shared(batch), optimizer)
 
     make_step = prepared(step, optimizer, cudagraph and same_steps and processes() == 1)
     for iteration in loop:

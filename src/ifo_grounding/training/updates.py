@@ -56,9 +56,9 @@ def total_loss(losses: TensorDictBase) -> Tensor:
 
 
 def update(
-    losses: TensorDictBase, optimizer: torch.optim.Optimizer, grad_clip: float
+    losses: TensorDictBase, optimizer: torch.optim.Optimizer, grad_clip: float = 1.0
 ) -> dict[str, Tensor]:
-    """Make one gradient step and return what the losses and metrics were."""
+    """Make one gradient step, of this norm at most; return what losses and metrics were."""
     optimizer.zero_grad(set_to_none=True)
     total_loss(losses).backward()
     trained = [p for group in optimizer.param_groups for p in group["params"]]
