@@ -6,7 +6,7 @@ python recipes/reproduce.py table=2 presets=[strong] seeds=[0]
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import product
@@ -21,6 +21,7 @@ from ifo_grounding.cli import recipe_main
 from ifo_grounding.cluster import Call, run_on_cluster
 from ifo_grounding.errors import UserError, check_choice, check_range
 from ifo_grounding.files import home
+from ifo_grounding.networks.config import PRESETS
 from ifo_grounding.tasks import TASKS
 from ifo_grounding.training import Run
 from ifo_grounding.training.checkpoint import leaves, written
@@ -52,8 +53,8 @@ class ReproduceOptions:
     """Of BabyAI, such as ``[GoToObj,GoToLocal,PickupLoc]``."""
     tasks: list[str] = field(default_factory=lambda: list(TASKS))
     """Of which tasks."""
-    presets: list[str] = field(default_factory=lambda: ["strong", "paper"])
-    """With which presets."""
+    presets: list[str] = field(default_factory=list)
+    """With which presets: by default ``strong`` and ``paper``, of Table 1 ``strong``."""
     seeds: list[int] = field(default_factory=lambda: [0])
     """With which seeds."""
     demonstrations: list[int] = field(default_factory=list)
@@ -99,8 +100,7 @@ class ReproduceOptions:
         for kind in ("table", "figure"):
             if (number := getattr(self, kind)) is not None:
                 check_choice(kind, number, [of for which, of in WANTED if which == kind])
-        presets = ("strong", "paper")
-        for kind, of in (("task", TASKS), ("preset", presets), ("method", METHODS)):
+        for kind, of in (("task", TASKS), ("preset", PRESETS), ("method", METHODS)):
             for name in getattr(self, f"{kind}s"):
                 check_choice(kind, name, of)
         check_range(self, "jobs", least=1)
@@ -140,15 +140,17 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
     needed = {phase for key in asked for phase in WANTED[key]}
     phases = [phase for phase in options.phase if phase in needed]
 
-    def runs(*numbers: int) -> Iterator[tuple[int, int, str, str]]:
-        demonstrations = options.demonstrations or numbers
-        return product(options.seeds, demonstrations, options.presets, options.tasks)
+    def runs(presets: Sequence[str], *numbers: int) -> Iterator[tuple[int, int, str, str]]:
+        demonstrations, presets = options.demonstrations or numbers, options.presets or presets
+        return product(options.seeds, demonstrations, presets, options.tasks)
 
     chains = []
     if phases:
-        chains = [[of_phase(options, *run, phase) for phase in phases] for run in runs(80_000)]
+        chains = [
+            [of_phase(options, *run, phase) for phase in phases] for run in runs([*PRESETS], 80_000)
+        ]
     if options.table == 1:
-        chains += [list(of_methods(options, *run)) for run in runs(200, 2000, 20_000)]
+        chains += [list(of_methods(options, *run)) for run in runs(["strong"], 200, 2000, 20_000)]
     levels = product(options.seeds, options.demonstrations or [1000, 5000], options.levels)
     return chains + [[of_level(options, *level)] for level in levels]
 

@@ -109,7 +109,7 @@ def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_pa
 
     from ifo_grounding.baselines.config import METHODS
 
-    asked = reproduce_options("table=1", "tasks=[move,pick]", "presets=[strong]", "seeds=[3]")
+    asked = reproduce_options("table=1", "tasks=[move,pick]", "seeds=[3]")
     chains = pieces(asked)
     assert len(chains) == 2 * 3  # tasks, numbers of demonstrations
     assert {piece.call.recipe for chain in chains for piece in chain} == {"baselines"}
@@ -132,7 +132,7 @@ def test_table_1_is_a_piece_for_each_method_of_one_run(reproduce_options, tmp_pa
 def test_table_1_of_some_methods_with_more_frames_has_files_of_its_own(reproduce_options, tmp_path):
     from reproduce import pieces
 
-    asked = ("table=1", "tasks=[pick]", "demonstrations=[200]", "presets=[strong]")
+    asked = ("table=1", "tasks=[pick]", "demonstrations=[200]")
     ((gail, agile),) = pieces(
         reproduce_options(*asked, "methods=[agile,gail]", "frames=2000000", "seeds=[1]")
     )
@@ -151,7 +151,7 @@ def test_every_method_of_table_1_is_tuned_by_as_many_trials(reproduce_options):
     from ifo_grounding.baselines.config import METHODS
 
     asked = reproduce_options("table=1", "tune=true", "tasks=[move]", "demonstrations=[200]")
-    (of_strong, _) = pieces(asked)
+    (of_strong,) = pieces(asked)
     trials: dict[str, list] = {method: [] for method in METHODS}
     for piece in of_strong:
         given = dict(word.split("=", 1) for word in piece.call.options)
