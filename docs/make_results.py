@@ -135,8 +135,10 @@ USES = {
     "random": "",
 }
 """Methods of Table 1, and what they use beside frames and instructions."""
-FEW = (200, "strong", "")
-"""What runs of every task share in the first table of Table 1."""
+FEW = 200
+"""Demonstrations of the first table of Table 1."""
+STRONG = ("strong", "")
+"""Preset and number of frames of most runs of Table 1."""
 PEERS = ("ours", "imitation", "imitation, own reward")
 """What learns GAIL in `benchmarks/gail.py`."""
 
@@ -166,22 +168,33 @@ def title_of(task: str, number: int, preset: str, frames: str = "") -> str:
     return ", ".join(filter(None, (f"{task} {number:,}", *said)))
 
 
-def baseline_rows(few: bool) -> list[Row]:
-    """Return a row for each method of Table 1: every task with 200, or what else ran."""
-    found = {k: v for k, v in by_method().items() if (k[1:] == FEW) == few}
+def baseline_rows(number: int) -> list[Row]:
+    """Return a row for each method of Table 1, of every task with so many demonstrations."""
+    sets = {key[0]: of for key, of in by_method().items() if key[1:] == (number, *STRONG)}
     return [
         {"method": f"`{method}`" + (f": {used}" if used else "")}
-        | {
-            title_of(*key) + more_seeds(*methods.values()): (
-                brief(rate(methods[method], method)) + own_seeds(methods, method)
-                if method in methods
-                else ""
-            )
-            for key, methods in found.items()
-        }
+        | {task + more_seeds(*of.values()): cell(of, method) for task, of in sets.items()}
         for method, used in USES.items()
-        if (few or method not in UNLEARNED) and any(method in of for of in found.values())
+        if (number == FEW or method not in UNLEARNED) and any(method in of for of in sets.values())
     ]
+
+
+def further_rows() -> list[Row]:
+    """Return a row for each other preset or number of frames, of the methods that ran so."""
+    sets = {key: of for key, of in by_method().items() if key[2:] != STRONG}
+    ran_so = [method for method in USES if any(method in of for of in sets.values())]
+    return [
+        {"demonstrations": title_of(*key) + more_seeds(*of.values())}
+        | {f"`{method}`": cell(of, method) for method in ran_so}
+        for key, of in sets.items()
+    ]
+
+
+def cell(methods: dict[str, Runs], method: str) -> str:
+    """Return how often a method succeeds, if it ran."""
+    if method not in methods:
+        return ""
+    return brief(rate(methods[method], method)) + own_seeds(methods, method)
 
 
 def most_seeds(*methods: Runs) -> int:
@@ -208,7 +221,7 @@ def discriminator_rows() -> list[Row]:
     """Return what discriminators say in the end: of demonstrations, unseen ones, the policy's."""
     rows: list[Row] = []
     for key, methods in by_method().items():
-        if key[1] > 2000 or key[2:] != ("strong", ""):
+        if key[1] > 2000 or key[2:] != STRONG:
             continue
         found: Row = {}
         for method, runs in methods.items():
@@ -258,9 +271,9 @@ def ahead_rows() -> list[Row]:
         both = {method: runs for method, runs in both.items() if runs}
         behind = {method: difference(runs, method, "ours") for method, runs in both.items()}
         row = ahead_row(title_of(*key) + more_seeds(*found.values()), behind) if both else {}
-        if row and (key[1:] == FEW or row["not ahead of"] == "none"):
+        if row and (key[1:] == (FEW, *STRONG) or row["not ahead of"] == "none"):
             rows.append(row)
-        if key[1:] == FEW:
+        if key[1:] == (FEW, *STRONG):
             for method, runs in both.items():
                 of_tasks.setdefault(method, []).append(runs)
     of_all = {m: over_tasks(of, m) for m, of in of_tasks.items() if len(of) == len(TASKS)}
@@ -363,8 +376,8 @@ def tables() -> dict[str, str]:
         "up-to-2000": [row for key, row in rows.items() if 200 < key[1] <= 2000],
         "choices": choice_rows(200),
         "babyai": babyai_rows(),
-        "baselines": baseline_rows(few=True),
-        "baselines-more": baseline_rows(few=False),
+        **{f"baselines-{number}": baseline_rows(number) for number in (FEW, 2000, 20_000)},
+        "baselines-further": further_rows(),
         "ours-ahead": ahead_rows(),
         "discriminators": discriminator_rows(),
         "trials": trial_rows(),
