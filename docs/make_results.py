@@ -226,7 +226,7 @@ def discriminator_rows() -> list[Row]:
         found: Row = {}
         for method, runs in methods.items():
             said = [r["results"]["discriminator"] for r in runs if "discriminator" in r["results"]]
-            if said and "agile" not in method:  # which spares what of the policy's it likes best
+            if said and method in ("gail", "gaifo"):  # AGILE spares what it likes best
                 means = (
                     fmean(of[who] for of in said) for who in ("demonstrated", "unseen", "policy")
                 )

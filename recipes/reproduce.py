@@ -16,7 +16,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from tqdm import tqdm
 
-from ifo_grounding.baselines.config import METHODS, PLANNED, UNLEARNED
+from ifo_grounding.baselines.config import METHODS, PLANNED, READS, UNLEARNED
 from ifo_grounding.cli import recipe_main
 from ifo_grounding.cluster import Call, run_on_cluster
 from ifo_grounding.errors import UserError, check_choice, check_range
@@ -63,7 +63,8 @@ class ReproduceOptions:
     methods: list[str] = field(default_factory=lambda: list(METHODS))
     """Of Table 1: which methods."""
     frames: int = 600_000
-    """Of Table 1: steps of the simulator that adversarial methods learn from."""
+    """Of Table 1: steps of the simulator that adversarial methods learn from; of another number
+    only these are made."""
     jobs: int = 2
     """Chains of pieces side by side, each on one thread."""
     ray: bool = False
@@ -196,6 +197,8 @@ def of_methods(
     for method in options.tuning if options.tune else METHODS:
         if method not in options.methods or (method == "lc-rl" and task not in PLANNED):
             continue
+        if more and "frames" not in READS.get(method, ()):
+            continue  # the same, whatever the number
         if not options.tune:
             if method in UNLEARNED and seed != options.seeds[0]:
                 continue  # the same in the same scenes

@@ -134,7 +134,7 @@ def test_table_1_of_some_methods_with_more_frames_has_files_of_its_own(reproduce
 
     asked = ("table=1", "tasks=[pick]", "demonstrations=[200]")
     ((gail, agile),) = pieces(
-        reproduce_options(*asked, "methods=[agile,gail]", "frames=2000000", "seeds=[1]")
+        reproduce_options(*asked, "methods=[agile,ours,bc,gail]", "frames=2000000", "seeds=[1]")
     )
     assert gail.file == tmp_path / "results/baselines/pick-200-strong-2M-gail-seed1.json"
     assert gail.call.run == agile.call.run == "baselines-pick-200-strong-2M-seed1"

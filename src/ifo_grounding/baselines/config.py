@@ -25,8 +25,14 @@ REFERENCES = {"true_actions": "bc", "demonstrator": "expert"}
 """Methods that ``references=true`` measures beside both phases, by their names in the results."""
 UNLEARNED = ("random", "expert")
 """Those that learn nothing, so that every seed does the same in the same scenes."""
-READS = {"bco-alpha": ("alpha",), "lc-rl": ("likelihood_steps",)}
-"""Options that a method reads; the others with options learn from a discriminator."""
+READS = {
+    "bco-alpha": ("alpha",),
+    "lc-rl": ("likelihood_steps",),
+    **dict.fromkeys(
+        ("gail", "gail+bc", "gaifo", "agile", "agile-chosen"), ("frames", "steps", "lr")
+    ),
+}
+"""Options that a method reads, if it has any."""
 PLANNED = ("move", "move-udlr")
 """The tasks of ``lc-rl``, whose plans are of the arm's cells."""
 
@@ -49,7 +55,7 @@ class BaselineConfig:
 
     def read_by(self, method: str) -> dict[str, float | None]:
         """Return the options that a method reads."""
-        return {name: getattr(self, name) for name in READS.get(method, ("frames", "steps", "lr"))}
+        return {name: getattr(self, name) for name in READS[method]}
 
     def __post_init__(self) -> None:
         check_numbers(self)
