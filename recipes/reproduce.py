@@ -153,7 +153,13 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
     if options.table == 1:
         chains += [list(of_methods(options, *run)) for run in runs(["strong"], 200, 2000, 20_000)]
     levels = product(options.seeds, options.demonstrations or [1000, 5000], options.levels)
-    return chains + [[of_level(options, *level)] for level in levels]
+    chains += [[of_level(options, *level)] for level in levels]
+    if not any(chains):
+        raise UserError(
+            f"no method of {options.methods} is of these tasks and frames: lc-rl plans "
+            f"{' and '.join(PLANNED)}, and frames={options.frames} is of adversarial methods"
+        )
+    return chains
 
 
 def of_phase(

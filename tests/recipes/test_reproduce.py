@@ -143,6 +143,8 @@ def test_table_1_of_some_methods_with_more_frames_has_files_of_its_own(reproduce
     assert options.variant == "2M"
     with pytest.raises(UserError, match="unknown method 'gial'"):
         reproduce_options(*asked, "methods=[gial]")
+    with pytest.raises(UserError, match="frames=700000 is of adversarial methods"):
+        pieces(reproduce_options(*asked, "methods=[bco]", "frames=700000"))
 
 
 def test_every_method_of_table_1_is_tuned_by_as_many_trials(reproduce_options):
