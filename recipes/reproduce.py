@@ -156,8 +156,8 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
     chains += [[of_level(options, *level)] for level in levels]
     if not any(chains):
         raise UserError(
-            f"methods=[{','.join(options.methods)}] has none for these tasks and frames: lc-rl plans "
-            f"{' and '.join(PLANNED)}, frames={options.frames} is of adversarial methods"
+            f"methods=[{','.join(options.methods)}] has none for these tasks and frames: lc-rl "
+            f"plans {' and '.join(PLANNED)}, frames={options.frames} is of adversarial methods"
         )
     return chains
 
