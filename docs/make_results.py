@@ -218,7 +218,7 @@ def own_seeds(methods: dict[str, Runs], method: str) -> str:
 
 
 def discriminator_rows() -> list[Row]:
-    """Return what discriminators say in the end: of demonstrations, unseen ones, the policy's."""
+    """Return what GAIL's and GAIfO's find in the end: demonstrations, unseen ones, the policy's."""
     rows: list[Row] = []
     for key, methods in by_method().items():
         if key[1] > 2000 or key[2:] != STRONG:
@@ -226,7 +226,7 @@ def discriminator_rows() -> list[Row]:
         found: Row = {}
         for method, runs in methods.items():
             said = [r["results"]["discriminator"] for r in runs if "discriminator" in r["results"]]
-            if said and method in ("gail", "gaifo"):  # AGILE spares what it likes best
+            if said and method in ("gail", "gaifo"):
                 means = (
                     fmean(of[who] for of in said) for who in ("demonstrated", "unseen", "policy")
                 )

@@ -152,14 +152,13 @@ def pieces(options: ReproduceOptions) -> list[list[Piece]]:
         ]
     if options.table == 1:
         chains += [list(of_methods(options, *run)) for run in runs(["strong"], 200, 2000, 20_000)]
+        if not any(chains):
+            raise UserError(
+                f"methods=[{','.join(options.methods)}] has none for these tasks and frames: lc-rl "
+                f"plans {' and '.join(PLANNED)}, frames={options.frames} is of adversarial methods"
+            )
     levels = product(options.seeds, options.demonstrations or [1000, 5000], options.levels)
-    chains += [[of_level(options, *level)] for level in levels]
-    if not any(chains):
-        raise UserError(
-            f"methods=[{','.join(options.methods)}] has none for these tasks and frames: lc-rl "
-            f"plans {' and '.join(PLANNED)}, frames={options.frames} is of adversarial methods"
-        )
-    return chains
+    return chains + [[of_level(options, *level)] for level in levels]
 
 
 def of_phase(
