@@ -270,7 +270,7 @@ def ahead_rows() -> list[Row]:
         both = {m: with_ours(runs, found.get("ours", [])) for m, runs in rivals.items()}
         both = {method: runs for method, runs in both.items() if runs}
         behind = {method: difference(runs, method, "ours") for method, runs in both.items()}
-        row = ahead_row(title_of(*key) + more_seeds(*found.values()), behind) if both else {}
+        row = ahead_row(title_of(*key) + more_seeds(*both.values()), behind) if both else {}
         if row and (key[1:] == (FEW, *STRONG) or row["not ahead of"] == "none"):
             rows.append(row)
         if key[1:] == (FEW, *STRONG):
@@ -305,7 +305,7 @@ def with_ours(runs: Runs, ours: Runs) -> Runs:
     """Return the results of runs beside ours of the same seed, where there are any."""
     same = {run["options"]["seed"]: run["results"] for run in ours}
     there = [run for run in runs if run["options"]["seed"] in same]
-    return [{"results": run["results"] | same[run["options"]["seed"]]} for run in there]
+    return [run | {"results": run["results"] | same[run["options"]["seed"]]} for run in there]
 
 
 def shown_p(value: float) -> str:
