@@ -85,7 +85,8 @@ def watch_tab(source: Source, visit: Any) -> Tab:
         """Say what is thought of a sentence while it is typed."""
         typed = said.strip()
         offered = visit.agent.complete(typed, visit.frame)
-        unfinished = offered and typed not in visit.agent.sentences
+        told = typed == visit.sentence  # where what was typed is heard after it was told
+        unfinished = offered and not told and typed not in visit.agent.sentences
         thought = "<p>Go on, or choose.</p>" if unfinished else _suits(visit, typed)
         return [gradio.Dataset(samples=[[each] for each in offered]), thought]
 
