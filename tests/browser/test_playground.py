@@ -145,6 +145,10 @@ def test_the_agent_is_talked_to(opened):
     says(opened, "#status", "0 words|Say something")
     tell(opened, "triangle")
     says(opened, "#status", "no sentence of this task, so that nobody can judge it")
+    typed(opened, "tri")
+    says(opened, "#status", "Go on, or choose")
+    typed(opened, "triangle")  # as it was told: heard once more, it keeps what was said of it
+    says(opened, "#status", "no sentence of this task, so that nobody can judge it")
     says(opened, "#boards", "step 0 of")
     opened.locator("#completions button").first.click()
     says(opened, "#status", "In truth: (it suits|it is so|something|the place)")
